@@ -1,0 +1,336 @@
+"""The loop: what a closed loop is, how one is run. Knows no spacecraft; imports only check and scores.
+
+Time runs in ticks of ``dt``. A tick happens at its instant: sensors read, on-board code decides, a log is
+written. Between ticks the continuous state flows, by RK4. Scenarios lie in lanes, the last axis of everything.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache, partial
+from math import prod, sqrt
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.extend.random import threefry_2x32
+
+from jaxatt import check, scores
+
+BLOCK = 128  # lanes that run together; with the seed it fixes a scenario's noise, so it is no option
+CHUNK = 10  # ticks whose noise is drawn together, and between which reverse mode keeps the state
+
+
+class Now(NamedTuple):
+    """The tick under way."""
+
+    k: Any  # () [1] number of the tick, traced
+    t: Any  # () [s] k dt
+    dt: float  # [s] to the next tick
+
+
+def _no_check(params, scenario) -> None:
+    pass
+
+
+class System(NamedTuple):
+    """A closed loop: functions and plain numbers, hence hashable and static under jit.
+
+    x is the continuous state, moved by ``flow`` and, at jumps, by ``tick``; z is what is held between ticks.
+    Both are pytrees (NamedTuples, as a rule). params is what the engineer ships, scenario what the day brings.
+    """
+
+    init: Callable  # (params, scenario) -> x, z for one scenario
+    tick: Callable  # (params, scenario, now, x, z, noise) -> x, z, log; noise (normals, *lanes), standard normal
+    flow: Callable  # (params, scenario, t, x, z) -> dx/dt
+    dt: float  # [s] between ticks
+    substeps: int = 1  # RK4 steps between ticks
+    normals: int = 0  # standard normal numbers that one tick consumes
+    check: Callable = _no_check  # (params, scenario) -> None, or ValueError on concrete bad input
+
+
+def rk4(f: Callable, t, x, h):
+    """One classical Runge-Kutta step of dx/dt = f(t, x) from t [s] over h [s]; x any pytree."""
+
+    def ahead(k, by):
+        return jax.tree.map(lambda a, b: a + by * b, x, k)
+
+    k1 = f(t, x)
+    k2 = f(t + h / 2, ahead(k1, h / 2))
+    k3 = f(t + h / 2, ahead(k2, h / 2))
+    k4 = f(t + h, ahead(k3, h))
+    return jax.tree.map(lambda a, b, c, d, e: a + h / 6 * (b + 2 * (c + d) + e), x, k1, k2, k3, k4)
+
+
+def every(k: int, now: Now, run: Callable, held):
+    """``run()`` on ticks 0, k, 2k, ..., ``held`` on the others; all lanes share the tick, so only one is computed."""
+    return jax.lax.cond(now.k % k == 0, run, lambda: held)
+
+
+def once(k, f: Callable, *operands):
+    """f(*operands), computed once.
+
+    XLA's CPU compiler repeats shared subexpressions in every consumer unless a control-flow boundary holds
+    them. This one is always taken, but k, the traced tick number, hides it.
+    """
+    shapes = jax.eval_shape(f, *operands)
+    return jax.lax.cond(
+        k >= 0, f, lambda *_: jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes), *operands
+    )
+
+
+def _like(tree, example, what: str):
+    """tree with the shapes and dtypes of example, so that a scan can carry it."""
+    if jax.tree.structure(tree) != jax.tree.structure(example):
+        raise TypeError(
+            f"`{what}` must return the structure {jax.tree.structure(example)}, but it is {jax.tree.structure(tree)}."
+        )
+
+    def fit(a, b):
+        if not jnp.can_cast(jnp.result_type(a), b.dtype, "same_kind"):
+            raise TypeError(f"`{what}` must return {b.dtype} where the state is {b.dtype}, but it is {jnp.result_type(a)}.")
+        if jnp.broadcast_shapes(jnp.shape(a), b.shape) != b.shape:
+            raise TypeError(f"`{what}` must return shape {b.shape} where the state has it, but it is {jnp.shape(a)}.")
+        return jnp.broadcast_to(jnp.asarray(a, b.dtype), b.shape)
+
+    return jax.tree.map(fit, tree, example)
+
+
+def _dtype(params, scenario):
+    floating = [a.dtype for a in jax.tree.leaves((params, scenario)) if jnp.issubdtype(a.dtype, jnp.floating)]
+    return jnp.result_type(*floating) if floating else jnp.result_type(1.0)
+
+
+def _start(system: System, params, scenario, lanes: int):
+    """x, z at tick 0, in the floating type of the run, every leaf with its lanes."""
+    init = partial(system.init, params)
+    for _ in range(lanes):
+        init = jax.vmap(init, in_axes=-1, out_axes=-1)
+    dtype = _dtype(params, scenario)
+
+    def strong(a):
+        a = jnp.asarray(a)
+        return a.astype(dtype if jnp.issubdtype(a.dtype, jnp.floating) else a.dtype)
+
+    return jax.tree.map(strong, init(scenario))
+
+
+def _step(system: System, params, scenario, k, state, noise):
+    """One tick and the flow to the next."""
+    dtype = _dtype(params, scenario)
+    now = Now(k, k.astype(dtype) * system.dt, system.dt)
+    x, z, log = system.tick(params, scenario, now, *state, noise)
+    x, z = _like((x, z), state, "tick")
+    h = system.dt / system.substeps
+
+    def flow(t, x):
+        return once(k, lambda t, x: _like(system.flow(params, scenario, t, x, z), x, "flow"), t, x)
+
+    if system.substeps == 1:
+        x = rk4(flow, now.t, x, h)
+    else:
+        times = now.t + h * jnp.arange(system.substeps, dtype=dtype)
+        x, _ = jax.lax.scan(lambda x, t: (rk4(flow, t, x, h), None), x, times)
+    return now, (x, z), log
+
+
+def _run(system: System, params, scenario, lanes: int, ticks: int, chunk: int, noise: Callable, fold: Callable, tally):
+    """Run the loop for ticks, chunk by chunk; noise(c) gives those of chunk c, shape (chunk, normals, *lanes).
+
+    fold(tally, now, log) -> tally, out is called at every tick. Returns the last tally and the outs, with two
+    leading axes (chunks, chunk); outs past the last tick are zero.
+    """
+    chunks = -(-ticks // chunk)
+
+    @jax.checkpoint
+    def one(carry, k, n):
+        state, tally = carry
+        now, state, log = _step(system, params, scenario, k, state, n)
+        tally, out = fold(tally, now, log)
+        return (state, tally), out
+
+    def guarded(carry, kn):
+        if ticks % chunk == 0:
+            return one(carry, *kn)
+        _, shapes = jax.eval_shape(one, carry, *kn)
+        nothing = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
+        return jax.lax.cond(kn[0] < ticks, one, lambda carry, k, n: (carry, nothing), carry, *kn)
+
+    @jax.checkpoint
+    def many(carry, c):
+        return jax.lax.scan(guarded, carry, (c * chunk + jnp.arange(chunk), noise(c)))
+
+    (_, tally), outs = jax.lax.scan(many, (_start(system, params, scenario, lanes), tally), jnp.arange(chunks))
+    return tally, outs
+
+
+# noise
+
+
+def _normal(bits, dtype):
+    """Standard normal numbers of random 32-bit words, by the inverse distribution; drawn in float32 and cast."""
+    u = ((bits >> 9).astype(jnp.float32) + 0.5) * 2.0**-22 - 1  # symmetric, never +-1
+    return (sqrt(2) * jax.lax.erf_inv(u)).astype(dtype)
+
+
+def _words(key, shape):
+    """Random 32-bit words of a raw key: both words of each threefry block are used, twice as fast as random.bits."""
+    return threefry_2x32(key, jnp.arange(prod(shape), dtype=jnp.uint32)).reshape(shape)
+
+
+def _chunk_noise(system: System, key, k0, ticks: int, lanes: tuple, dtype):
+    """Noise of the ticks k0 .. k0 + ticks - 1 from a raw key, shape (ticks, normals, *lanes)."""
+    shape = (system.normals, *lanes)
+    if system.normals == 0:
+        return jnp.zeros((ticks, *shape), dtype)
+    keys = jax.vmap(lambda k: jax.random.key_data(jax.random.fold_in(jax.random.wrap_key_data(key), k)))
+    bits = once(k0, lambda: jax.vmap(lambda key: _words(key, shape))(keys(k0 + jnp.arange(ticks))))
+    return once(k0, lambda bits: _normal(bits, dtype), bits)
+
+
+def raw_key(key):
+    """A key's raw words, shape (*lanes, 2), from a typed key of shape (*lanes) or a raw one.
+
+    Raises TypeError for anything else.
+    """
+    if hasattr(key, "dtype") and jax.dtypes.issubdtype(key.dtype, jax.dtypes.prng_key):
+        key = jax.random.key_data(key)
+    if not hasattr(key, "dtype") or key.dtype != jnp.uint32 or key.shape[-1:] != (2,):
+        raise TypeError(f"`key` must be a key of jax.random.key(seed), but it is {key!r}.")
+    return key
+
+
+def _block_key(key, block):
+    return jax.random.key_data(jax.random.fold_in(jax.random.wrap_key_data(key), block))
+
+
+def noise_of(system: System, key, index: int, ticks: int):
+    """The noise that scenario ``index`` of a sweep with this key meets, shape (ticks, normals), float32."""
+    key = _block_key(raw_key(key), index // BLOCK)
+    return _chunk_noise(system, key, jnp.asarray(0), ticks, (BLOCK,), jnp.float32)[..., index % BLOCK]
+
+
+# running one loop
+
+
+def simulate(system: System, params, scenario, noise_or_key, *, ticks: int, every: int = 1):
+    """Run a closed loop and return its log, time first: every leaf has shape (records, ..., *lanes).
+
+    noise_or_key: standard normal numbers of shape (ticks, normals, *lanes), or keys of shape (*lanes): one key
+    for one scenario, ``jax.random.split(key, n)`` for n lanes. With lanes, every leaf of the scenario carries
+    them in its last axis. every: keep the log of ticks 0, every, 2 every, ... Pure: jit, grad and vmap it.
+
+    Raises ValueError on input that the system's check refuses, on ticks or every < 1 and on noise of the wrong
+    shape; TypeError on what is no number or no key.
+    """
+    ticks, every = check.whole("ticks", ticks), check.whole("every", every)
+    params, scenario = admit(system, params, scenario)
+    if jnp.issubdtype(getattr(noise_or_key, "dtype", None), jnp.floating):
+        if noise_or_key.ndim < 2 or noise_or_key.shape[:2] != (ticks, system.normals):
+            check.refuse("noise", f"have shape ({ticks}, {system.normals}, *lanes)", noise_or_key.shape)
+        keyed = False
+    else:
+        noise_or_key = raw_key(noise_or_key)
+        keyed = True
+    lanes = noise_or_key.shape[:-1] if keyed else noise_or_key.shape[2:]
+    for path, leaf in jax.tree_util.tree_leaves_with_path(scenario) if lanes else ():
+        if leaf.shape[-len(lanes) :] != lanes:
+            name = f"scenario{jax.tree_util.keystr(path)}"
+            check.refuse(name, f"carry the lanes {lanes} of the noise in its last axis", f"of shape {leaf.shape}")
+    return _compiled(_simulate, 4)(system, ticks, every, keyed, params, scenario, noise_or_key)
+
+
+def _simulate(system, ticks, every, keyed, params, scenario, source):
+    chunk = CHUNK if every == 1 else every
+    dtype = _dtype(params, scenario)
+    lanes = source.shape[:-1] if keyed else source.shape[2:]
+    if keyed:
+
+        def noise(c):
+            draw = partial(_chunk_noise, system, k0=c * chunk, ticks=chunk, lanes=(), dtype=dtype)
+            draw_lanes = lambda key: draw(key)
+            for _ in lanes:
+                draw_lanes = jax.vmap(draw_lanes, in_axes=0, out_axes=-1)
+            return draw_lanes(source)
+
+    else:
+        padded = jnp.pad(source.astype(dtype), [(0, -ticks % chunk)] + [(0, 0)] * (source.ndim - 1))
+        chunks = padded.reshape(-1, chunk, *source.shape[1:])
+
+        def noise(c):
+            return chunks[c]
+
+    _, logs = _run(
+        system, params, scenario, len(lanes), ticks, chunk, noise, lambda none, now, log: (none, log), None
+    )
+    if every == 1:
+        return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:ticks], logs)
+    return jax.tree.map(lambda a: a[:, 0], logs)
+
+
+def admit(system: System, params, scenario):
+    """params and scenario through the door: converted, and checked by the system where they are concrete."""
+    params, scenario = check.converted(params, scenario)
+    system.check(params, scenario)
+    return params, scenario
+
+
+def block_scores(system: System, score: Callable, ticks: int, params, scenarios, key, block):
+    """Scores of one block of `BLOCK` scenarios: a tree of values of shape (..., BLOCK). Pure.
+
+    key: raw key of the sweep; block: number of the block, which with the key fixes its noise.
+    """
+    dtype = _dtype(params, scenarios)
+    key = _block_key(key, block)
+    noise = partial(_block_noise, system, key, dtype)
+
+    def fold(tally, now, log):
+        return scores.add(tally, score(params, scenarios, now, log)), None
+
+    def at_start():
+        state = _start(system, params, scenarios, 1)
+        now, _, log = _step(system, params, scenarios, jnp.asarray(0), state, noise(0)[0])
+        return score(params, scenarios, now, log)
+
+    shapes = jax.tree.map(lambda s: jax.ShapeDtypeStruct(_lane_shape(s.shape), s.dtype), jax.eval_shape(at_start))
+    nothing = jax.tree.map(scores.empty, shapes, is_leaf=scores.is_tally)
+    tally, _ = _run(system, params, scenarios, 1, ticks, CHUNK, noise, fold, nothing)
+    return scores.values(tally)
+
+
+def _lane_shape(shape):
+    return shape if shape[-1:] == (BLOCK,) else (*shape, BLOCK)
+
+
+def _block_noise(system, key, dtype, c):
+    return _chunk_noise(system, key, c * CHUNK, CHUNK, (BLOCK,), dtype)
+
+
+def block_log(system: System, ticks: int, params, scenarios, key, block, lane):
+    """The log, time first, of one lane of a block: the same computation as `block_scores`."""
+    noise = partial(_block_noise, system, _block_key(key, block), _dtype(params, scenarios))
+
+    def fold(none, now, log):
+        return none, jax.tree.map(lambda a: jnp.broadcast_to(a, _lane_shape(jnp.shape(a)))[..., lane], log)
+
+    _, logs = _run(system, params, scenarios, 1, ticks, CHUNK, noise, fold, None)
+    return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:ticks], logs)
+
+
+# compilation
+
+
+def in_trace() -> bool:
+    """Whether the caller is being traced by jit, grad or vmap."""
+    return isinstance(jnp.zeros(()) + 0, jax.core.Tracer)
+
+
+def _compiled(f: Callable, static: int):
+    """f jitted, its first ``static`` arguments static, with the CPU settings that a single jit can carry."""
+    return _jitted(f, static, in_trace() or jax.default_backend() != "cpu")
+
+
+@lru_cache(maxsize=None)
+def _jitted(f: Callable, static: int, plain: bool):
+    options = None if plain else {"xla_cpu_prefer_vector_width": 512}  # an inner jit may carry no options
+    return jax.jit(f, static_argnums=tuple(range(static)), compiler_options=options)

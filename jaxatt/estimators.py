@@ -1,0 +1,35 @@
+"""Estimators: what on-board code believes of the state."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from jaxatt.attitude import mrp_rate, mrp_rate_transposed
+from jaxatt.vec import Mat3, Vec3, cross, norm
+
+
+class AttitudeRate(NamedTuple):
+    """An attitude and a body rate: truth, reading, estimate or residual."""
+
+    q: Any  # Vec3 [1] MRP
+    w: Any  # Vec3 [rad/s]
+
+
+def mrp_observer(
+    estimate: AttitudeRate, y: AttitudeRate, u: Vec3, J: Mat3, J_inv: Mat3, alpha, beta, sign=-1
+) -> AttitudeRate:
+    """Rate of change of the nonlinear MRP observer's estimate, Yun & Kang (2020), eq. (7).
+
+    y: readings; u: torque [N m]; J: inertia [kg m^2]; alpha [1/s], beta [N m s]: gains; sign: -1 for Euler's
+    equation, +1 for the dynamics as printed (spec, 5.1). Eq. (6) prints S(w) J wh in place of S(wh) J w, for
+    which the Lyapunov identity fails (spec, 5.2).
+    """
+    xi_q, xi_w = y.q - estimate.q, y.w - estimate.w
+    torque = sign * cross(estimate.w, J @ y.w) + beta * xi_w + mrp_rate_transposed(y.q, xi_q) + u
+    return AttitudeRate(q=mrp_rate(y.q, estimate.w) + alpha * xi_q, w=J_inv @ torque)
+
+
+def residual_norm(y: AttitudeRate, estimate: AttitudeRate):
+    """|xi|: norm of reading minus estimate, MRP and rad/s added without weights as in the paper."""
+    xi_q, xi_w = norm(y.q - estimate.q), norm(y.w - estimate.w)
+    return norm(Vec3(xi_q, xi_w, 0.0))

@@ -1,0 +1,171 @@
+"""Tallies: what a sweep keeps of a run instead of its trajectory.
+
+A score is one pure function (params, scenario, now, log) -> tree of tallies. The tally of a whole run is the
+sum of those of its ticks, and `values` turns the sum into numbers. The defaults of a tally's fields are those
+of an empty run. A NaN in the log stays visible: means, extremes and final values become NaN, `always` False.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxatt.vec import safe_sqrt
+
+
+class Mean(NamedTuple):
+    """Mean over the ticks of a window; NaN if it held none."""
+
+    total: Any = 0.0
+    ticks: Any = 0.0
+
+    def __add__(self, later):
+        return Mean(self.total + later.total, self.ticks + later.ticks)
+
+    def value(self):
+        empty = self.ticks == 0
+        return jnp.where(empty, jnp.nan, self.total / jnp.where(empty, 1, self.ticks))
+
+
+class Rms(NamedTuple):
+    """Root mean square over the ticks of a window; NaN if it held none."""
+
+    total: Any = 0.0
+    ticks: Any = 0.0
+
+    def __add__(self, later):
+        return Rms(self.total + later.total, self.ticks + later.ticks)
+
+    def value(self):
+        return safe_sqrt(Mean(*self).value())
+
+
+class Peak(NamedTuple):
+    """Largest value in a window; NaN if it held no tick."""
+
+    largest: Any = -jnp.inf
+
+    def __add__(self, later):
+        return Peak(jnp.maximum(self.largest, later.largest))
+
+    def value(self):
+        return jnp.where(self.largest == -jnp.inf, jnp.nan, self.largest)
+
+
+class First(NamedTuple):
+    """First time [s] at which something held; inf if never."""
+
+    t: Any = jnp.inf
+
+    def __add__(self, later):
+        return First(jnp.minimum(self.t, later.t))
+
+    def value(self):
+        return self.t
+
+
+class Settling(NamedTuple):
+    """Last time [s] outside a band in a window; 0 if never, inf if still outside at its end, NaN if it held no tick."""
+
+    outside: Any = -jnp.inf
+    end: Any = -jnp.inf
+
+    def __add__(self, later):
+        return Settling(jnp.maximum(self.outside, later.outside), jnp.maximum(self.end, later.end))
+
+    def value(self):
+        settled = jnp.where(self.outside == self.end, jnp.inf, jnp.maximum(self.outside, 0))
+        return jnp.where(self.end == -jnp.inf, jnp.nan, settled)
+
+
+class Always(NamedTuple):
+    """Whether something held at every tick."""
+
+    held: Any = True
+
+    def __add__(self, later):
+        return Always(self.held & later.held)
+
+    def value(self):
+        return self.held
+
+
+class Final(NamedTuple):
+    """Value at the last tick."""
+
+    last: Any = jnp.nan
+
+    def __add__(self, later):
+        return later
+
+    def value(self):
+        return self.last
+
+
+def _where(inside, value, otherwise):
+    return value if inside is True else jnp.where(inside, value, otherwise)
+
+
+def mean(value, inside=True) -> Mean:
+    """Tally the mean of value (a bool gives a share) over the ticks where ``inside`` holds."""
+    value = jnp.asarray(value, jnp.result_type(value, 1.0))
+    return Mean(_where(inside, value, 0), jnp.broadcast_to(jnp.asarray(inside, value.dtype), value.shape))
+
+
+def rms(square, inside=True) -> Rms:
+    """Tally a root mean square; takes the squared value, for instance ``log.q @ log.q``."""
+    return Rms(*mean(square, inside))
+
+
+def peak(value, inside=True) -> Peak:
+    """Tally the largest value over the ticks where ``inside`` holds."""
+    return Peak(_where(inside, value, -jnp.inf))
+
+
+def first(now, condition, since=0.0) -> First:
+    """Tally the first time [s], counted from ``since``, at which the condition holds."""
+    return First(jnp.where(condition, now.t - since, jnp.inf))
+
+
+def settling(now, outside, inside=True) -> Settling:
+    """Tally the settling time [s]: the last time at which ``outside`` holds, in the window ``inside``."""
+    end = _where(inside, jnp.broadcast_to(now.t, jnp.shape(outside)), -jnp.inf)
+    return Settling(jnp.where(outside, end, -jnp.inf), end)
+
+
+def always(condition) -> Always:
+    """Tally whether the condition holds at every tick."""
+    return Always(condition)
+
+
+def final(value) -> Final:
+    """Tally the value at the last tick."""
+    return Final(value)
+
+
+def finite(tree):
+    """Whether every number of a tree of (*lanes) leaves is finite, shape (*lanes)."""
+    total = sum(jax.tree.leaves(tree))  # one inf or NaN makes the sum inf or NaN
+    return jnp.isfinite(total)
+
+
+def is_tally(node) -> bool:
+    """Whether a node of a score tree is a tally: anything with ``+`` and ``value()``."""
+    return hasattr(node, "value") and callable(node.value)
+
+
+def empty(tally):
+    """The tally of no tick, with the shapes and dtypes of the given one."""
+    return type(tally)(*(jnp.full(a.shape, d, a.dtype) for a, d in zip(tally, type(tally)())))
+
+
+def add(a, b):
+    """Sum of two trees of tallies, b later than a."""
+    return jax.tree.map(lambda x, y: x + y, a, b, is_leaf=is_tally)
+
+
+def values(tree):
+    """The numbers of a tree of tallies."""
+    return jax.tree.map(lambda tally: tally.value(), tree, is_leaf=is_tally)

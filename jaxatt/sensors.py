@@ -1,0 +1,20 @@
+"""Sensor triads: how star sensors and gyros read, faults included."""
+
+from __future__ import annotations
+
+from jaxatt.faults import channel, read
+from jaxatt.vec import Vec3
+
+
+def triad(faults: Vec3, t, std, normals, last: Vec3) -> Vec3:
+    """The three channels of a star sensor or rate gyro from tick time t [s] on, a `Vec3` of `Channel`.
+
+    faults: `Vec3` of `Fault`; std: standard deviation of each channel's noise; normals: standard normal numbers
+    of shape (6, *lanes), three for the noise and three for random faults; last: the previous reading.
+    """
+    return Vec3(*map(channel, faults, (t, t, t), (std * n for n in normals[:3]), normals[3:], last))
+
+
+def read_triad(channels: Vec3, truth: Vec3) -> Vec3:
+    """The reading of a triad whose true signals are ``truth``."""
+    return Vec3(*map(read, channels, truth))

@@ -1,0 +1,78 @@
+"""Studies: what one does with a closed loop, in memory: sweep many scenarios, rerun one, tune by gradient."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from tqdm.auto import tqdm
+
+from jaxatt import check
+from jaxatt.engine import BLOCK, System, _compiled, admit, block_log, block_scores, in_trace, raw_key
+
+
+def sweep(system: System, params, scenarios, key, *, ticks: int, score: Callable, progress: bool | None = None):
+    """Score many scenarios: the tree of ``score``, with values of shape (..., n).
+
+    scenarios: every leaf carries the n scenarios in its last axis; params none. Scenario i meets the noise
+    ``noise_of(system, key, i, ticks)``; its result does not depend on n, bit for bit, nor on the number of
+    devices. Blocks run one after the other on every local device, so memory does not grow with ticks and only
+    with the scores in n. progress: show a bar; None shows it once a sweep has run for two seconds.
+
+    Under jit, grad or vmap the same numbers come from one traced loop over the blocks.
+
+    Raises ValueError for leaves without scenarios, by name, and for what the system's check refuses; TypeError
+    for what is no number or no key.
+    """
+    ticks, n = check.whole("ticks", ticks), check.lanes(scenarios)
+    params, scenarios = admit(system, params, scenarios)
+    key = raw_key(key)
+    blocks = -(-n // BLOCK)
+    if in_trace() or not check.concrete((params, scenarios, key)):
+        return _traced(system, score, ticks, params, scenarios, key, n, blocks)
+    run = _compiled(block_scores, 3)
+    devices = jax.local_devices()
+    scenarios = jax.tree.map(np.asarray, scenarios)
+    at = [jax.device_put((params, key), device) for device in devices]
+    done: list = []
+    under_way: deque = deque()
+    quiet = progress is False
+    with tqdm(total=n, unit=" scenarios", disable=quiet, delay=0 if progress else 2, leave=False) as bar:
+        for block in range(blocks):
+            device = block % len(devices)
+            here = jax.device_put((block_of(scenarios, block), np.int32(block)), devices[device])
+            under_way.append(run(system, score, ticks, at[device][0], here[0], at[device][1], here[1]))
+            if len(under_way) > 2 * len(devices) or block == blocks - 1:
+                while len(under_way) > (0 if block == blocks - 1 else 2 * len(devices) - 1):
+                    done.append(jax.tree.map(np.asarray, under_way.popleft()))
+                    bar.update(min(BLOCK, n - (len(done) - 1) * BLOCK))
+    return jax.tree.map(lambda *parts: np.concatenate(parts, axis=-1)[..., :n], *done)
+
+
+def block_of(scenarios, block: int):
+    """The scenarios of one block, the last one repeated where the block is not full."""
+    index = np.arange(block * BLOCK, (block + 1) * BLOCK)
+
+    def take(leaf):
+        if index[-1] < leaf.shape[-1]:
+            return leaf[..., index[0] : index[-1] + 1]
+        return leaf[..., np.minimum(index, leaf.shape[-1] - 1)]
+
+    return jax.tree.map(take, scenarios)
+
+
+def _traced(system, score, ticks, params, scenarios, key, n, blocks):
+    def split(leaf):
+        leaf = jnp.concatenate([leaf, jnp.repeat(leaf[..., -1:], blocks * BLOCK - n, axis=-1)], axis=-1)
+        return jnp.moveaxis(leaf.reshape(*leaf.shape[:-1], blocks, BLOCK), -2, 0)
+
+    def one(block_and_scenarios):
+        block, scenarios = block_and_scenarios
+        return block_scores(system, score, ticks, params, scenarios, key, block)
+
+    out = jax.lax.map(one, (jnp.arange(blocks), jax.tree.map(split, scenarios)))
+    return jax.tree.map(lambda a: jnp.moveaxis(a, 0, -2).reshape(*a.shape[1:-1], -1)[..., :n], out)
