@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxatt import check
-from jaxatt.vec import Vec3
+from jaxatt.vec import Vec3, safe_sqrt
 
 
 class Fault(NamedTuple):
@@ -70,19 +70,22 @@ def first_onset(faults):
     return reduce(jnp.minimum, [f.onset for f in faults])
 
 
-def channel(fault: Fault, t, noise, random, last) -> Channel:
+def channel(fault: Fault, t, std, normal, last) -> Channel:
     """The channel as it reads from tick time t [s] on.
 
-    noise: this tick's noise [channel unit]; random: a standard normal number for ``fault.random``; last: the
-    previous reading, which a stuck channel repeats. All of shape (*lanes).
+    std: standard deviation of its noise [channel unit]; normal: a standard normal number, which serves the noise
+    and ``fault.random`` together, for the sum of two Gaussian signals is one; last: the previous reading, which
+    a stuck channel repeats. All of shape (*lanes).
     """
     on = active(fault, t)
     stuck = on & (fault.stuck > 0)
     since = jnp.where(on, t - fault.onset, 0)
-    faulty = fault.bias + fault.drift * -jnp.expm1(-since / fault.tau) + fault.random * random + fault.growth * noise
+    grown = fault.growth * std
+    spread = safe_sqrt(grown * grown + fault.random * fault.random)
+    faulty = fault.bias + fault.drift * (1 - jnp.exp(-since / fault.tau)) + spread * normal
     return Channel(
         gain=jnp.where(stuck, 0, jnp.where(on, fault.scale, 1)),
-        offset=jnp.where(stuck, last, jnp.where(on, faulty, noise)),
+        offset=jnp.where(stuck, last, jnp.where(on, faulty, std * normal)),
     )
 
 

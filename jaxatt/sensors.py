@@ -10,9 +10,9 @@ def triad(faults: Vec3, t, std, normals, last: Vec3) -> Vec3:
     """The three channels of a star sensor or rate gyro from tick time t [s] on, a `Vec3` of `Channel`.
 
     faults: `Vec3` of `Fault`; std: standard deviation of each channel's noise; normals: standard normal numbers
-    of shape (6, *lanes), three for the noise and three for random faults; last: the previous reading.
+    of shape (3, *lanes); last: the previous reading.
     """
-    return Vec3(*map(channel, faults, (t, t, t), (std * n for n in normals[:3]), normals[3:], last))
+    return Vec3(*(channel(f, t, std, n, v) for f, n, v in zip(faults, normals, last)))
 
 
 def read_triad(channels: Vec3, truth: Vec3) -> Vec3:

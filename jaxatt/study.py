@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 from tqdm.auto import tqdm
 
 from jaxatt import check
@@ -76,3 +77,74 @@ def _traced(system, score, ticks, params, scenarios, key, n, blocks):
 
     out = jax.lax.map(one, (jnp.arange(blocks), jax.tree.map(split, scenarios)))
     return jax.tree.map(lambda a: jnp.moveaxis(a, 0, -2).reshape(*a.shape[1:-1], -1)[..., :n], out)
+
+
+def rerun(system: System, params, scenarios, key, index: int, *, ticks: int):
+    """The log, time first, of scenario ``index`` of a sweep with the same arguments: the same run, bit for bit.
+
+    Raises what `sweep` raises, and ValueError for an index that is not one of the scenarios.
+    """
+    ticks, n = check.whole("ticks", ticks), check.lanes(scenarios)
+    index = check.whole("index", index, 0)
+    if index >= n:
+        check.refuse("index", f"be less than the {n} scenarios", index)
+    params, scenarios = admit(system, params, scenarios)
+    block, lane = divmod(index, BLOCK)
+    here = block_of(jax.tree.map(np.asarray, scenarios), block)
+    return _compiled(block_log, 2)(system, ticks, params, here, raw_key(key), np.int32(block), np.int32(lane))
+
+
+class History(NamedTuple):
+    """What `tune` met, step by step; every leaf leads with the steps."""
+
+    theta: Any  # parameters at which the step was taken
+    cost: Any  # (steps,) their cost
+    gradient: Any  # (steps,) norm of the gradient
+    step: Any  # (steps,) [1] factor on the optimizer's update: below 1 after a step that ended in NaN
+
+
+def tune(cost: Callable, theta, optimizer, steps: int, key, *, progress: bool | None = None) -> tuple[Any, History]:
+    """Minimise cost(theta, key), a scalar, over a pytree theta; returns the best theta met and the `History`.
+
+    Every step sees the same key: with common random numbers the cost is a smooth function and "best" has a
+    meaning. optimizer: any of optax. A step that ends in a cost or gradient that is not finite is taken back:
+    the search goes on from the best theta with updates half as long. Gains that must stay positive are tuned as
+    logarithms.
+
+    Raises ValueError if the cost is not finite at the start or steps < 1, TypeError if it is no scalar.
+    """
+    steps = check.whole("steps", steps)
+    theta = jax.tree.map(lambda a: jnp.asarray(a, jnp.result_type(a, float)), theta)
+
+    def step(theta, state, factor):
+        value, gradient = jax.value_and_grad(cost)(theta, key)
+        size = optax.global_norm(gradient)
+        updates, state = optimizer.update(gradient, state, theta, value=value, grad=gradient, value_fn=cost) if (
+            isinstance(optimizer, optax.GradientTransformationExtraArgs)
+        ) else optimizer.update(gradient, state, theta)
+        updates = jax.tree.map(lambda u: factor * u, updates)
+        return value, size, optax.apply_updates(theta, updates), state
+
+    step = _compiled(step, 0)
+    state, factor = optimizer.init(theta), 1.0
+    best = (np.inf, theta, state)
+    trail = []
+    with tqdm(total=steps, unit=" steps", disable=progress is False, delay=0 if progress else 2, leave=False) as bar:
+        for _ in range(steps):
+            value, size, ahead, ahead_state = step(theta, state, factor)
+            value, size = float(value), float(size)
+            trail.append((theta, value, size, factor))
+            if np.isfinite(value) and np.isfinite(size):
+                if value < best[0]:
+                    best = (value, theta, state)
+                theta, state = ahead, ahead_state
+            elif np.isinf(best[0]):
+                check.refuse("cost", "be finite, with a finite gradient, at the start", value)
+            else:
+                _, theta, state = best
+                factor /= 2
+            bar.set_postfix(cost=f"{value:.4g}", refresh=False)
+            bar.update()
+    thetas, values, sizes, factors = zip(*trail)
+    stacked = jax.tree.map(lambda *a: np.stack(a), *thetas)
+    return best[1], History(stacked, np.array(values), np.array(sizes), np.array(factors))

@@ -170,3 +170,18 @@ def safe_sqrt(a):
     """Square root of a >= 0 whose gradient at zero is zero, not infinite."""
     positive = a > 0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, a, 1)), a)
+
+
+def once(f, *operands):
+    """f(*operands), computed once and kept.
+
+    XLA's CPU compiler repeats shared subexpressions in every consumer, each output of a fusion on its own, unless
+    a control-flow boundary holds them. This one is always taken, but the compiler does not know.
+    """
+    traced = [leaf for leaf in jax.tree.leaves(operands) if isinstance(leaf, jax.core.Tracer)]
+    if not traced:
+        return f(*operands)
+    shapes = jax.eval_shape(f, *operands)
+    # tied to an operand, lest reverse mode on JAX 0.10 takes the branch apart before the operand is known
+    always, _ = jax.lax.optimization_barrier((jnp.asarray(True), jax.lax.stop_gradient(traced[0])))
+    return jax.lax.cond(always, f, lambda *_: jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes), *operands)

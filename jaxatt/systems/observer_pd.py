@@ -140,9 +140,9 @@ def init(params: Params, scenario: Scenario):
 
 
 def sense(params: Params, scenario: Scenario, now, x: X, z: Z, noise):
-    """How the sensors err until the next tick, and what they read now; noise: 12 normals, star sensor first."""
-    star = triad(scenario.star, now.t, scenario.std_q, noise[:6], z.sensors.y.q)
-    gyro = triad(scenario.gyro, now.t, scenario.std_w, noise[6:], z.sensors.y.w)
+    """How the sensors err until the next tick, and what they read now; noise: 6 normals, star sensor first."""
+    star = triad(scenario.star, now.t, scenario.std_q, noise[:3], z.sensors.y.q)
+    gyro = triad(scenario.gyro, now.t, scenario.std_w, noise[3:], z.sensors.y.w)
     y = AttitudeRate(read_triad(star, x.q), read_triad(gyro, x.w))
     return Held(star, gyro, y)
 
@@ -246,6 +246,6 @@ def refuse_bad(params: Params, scenario: Scenario) -> None:
             check_fault(f"scenario.{name}.{axis}", fault)
 
 
-system = System(init, tick, flow, dt=DT, substeps=4, normals=12, check=refuse_bad)
+system = System(init, tick, flow, dt=DT, substeps=4, normals=6, check=refuse_bad)
 params = Params()
 scenario = Scenario()

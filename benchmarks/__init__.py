@@ -1,0 +1,1 @@
+"""How fast, as ratios in one run: one module per closed loop, ``rows(quick)`` in each; ``python -m benchmarks``."""

@@ -1,0 +1,38 @@
+"""Reproduce the papers: ``python -m experiments [NAME ...] [--quick] [--out DIR]``."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import sys
+from pathlib import Path
+
+import jax
+
+import jaxatt
+
+NAMES = ("observer_pd",)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="python -m experiments", description=__doc__)
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(NAMES)}; none for all")
+    parser.add_argument("--quick", action="store_true", help="smaller Monte Carlo runs, the same checks")
+    parser.add_argument("--out", type=Path, default=Path("results"), help="folder for figures and metrics.json")
+    args = parser.parse_args()
+    unknown = [name for name in args.names if name not in NAMES]
+    if unknown:
+        parser.error(f"`NAME` must be one of {', '.join(NAMES)}, but it is {unknown[0]}.")
+    jax.config.update("jax_enable_x64", True)
+    jaxatt.fast_cpu()
+    from experiments.report import Report
+
+    report = Report(args.out, args.quick)
+    for name in args.names or NAMES:
+        report.start(name)
+        importlib.import_module(f"experiments.{name}").run(report)
+    return 0 if report.write() else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

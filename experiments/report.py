@@ -1,0 +1,97 @@
+"""What an experiment leaves behind: checks against the paper, printed as a table, figures, and metrics.json."""
+
+from __future__ import annotations
+
+import json
+import platform
+from pathlib import Path
+
+import jax
+import matplotlib
+import numpy as np
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt  # noqa: E402  after the backend is chosen
+
+
+class Report:
+    """Collects checks and figures of the experiments of one run. quick: shrink Monte Carlo sizes only."""
+
+    def __init__(self, out: Path, quick: bool):
+        self.out, self.quick = Path(out), quick
+        self.checks: list[dict] = []
+        self.figures: list[str] = []
+        self.experiment = ""
+
+    def start(self, experiment: str) -> None:
+        """Print the head of an experiment's table."""
+        self.experiment = experiment
+        print(f"\n{experiment}\n{'check':58} {'paper or reference':>26} {'ours':>26} {'tolerance':>12}  ok", flush=True)
+
+    def check(self, name: str, expected, measured, tolerance, source: str) -> bool:
+        """measured, a number or a list, must equal expected within +-tolerance (a number or a list)."""
+        difference = np.abs(np.asarray(measured, float) - np.asarray(expected, float))
+        return self._add(name, _plain(expected), measured, tolerance, source, bool(np.all(difference <= tolerance)))
+
+    def relative(self, name: str, expected, measured, tolerance: float, source: str) -> bool:
+        """measured must equal expected within tolerance times expected."""
+        return self.check(name, expected, measured, (tolerance * np.abs(np.asarray(expected))).tolist(), source)
+
+    def within(self, name: str, low, high, measured, source: str) -> bool:
+        """measured, a number or a list, must lie in [low, high]; None leaves a side open."""
+        a = np.asarray(measured, float)
+        ok = (low is None or np.all(a >= low)) and (high is None or np.all(a <= high))
+        expected = f">= {low:g}" if high is None else f"<= {high:g}" if low is None else f"{low:g} to {high:g}"
+        return self._add(name, expected, measured, 0, source, bool(ok))
+
+    def note(self, text: str) -> None:
+        """Print a result that has no reference to be checked against."""
+        print(f"  {text}", flush=True)
+
+    def figure(self, name: str, fig) -> None:
+        """Save a figure as PNG under the experiment's name and close it."""
+        path = self.out / self.experiment / f"{name}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        fig.savefig(path, dpi=150, bbox_inches="tight")
+        plt.close(fig)
+        self.figures.append(str(path.relative_to(self.out)))
+
+    def write(self) -> bool:
+        """Write metrics.json; return whether every check is ok."""
+        versions = {"python": platform.python_version(), "jax": jax.__version__, "numpy": np.__version__}
+        self.out.mkdir(parents=True, exist_ok=True)
+        metrics = {"checks": self.checks, "figures": self.figures, "versions": versions}
+        (self.out / "metrics.json").write_text(json.dumps(metrics, indent=1) + "\n")
+        bad = [c["name"] for c in self.checks if not c["ok"]]
+        print(f"\n{len(self.checks) - len(bad)} of {len(self.checks)} checks ok, {len(self.figures)} figures", end="")
+        print(f"; written to {self.out}" + "".join(f"\nnot ok: {name}" for name in bad))
+        return not bad
+
+    def _add(self, name, expected, measured, tolerance, source, ok) -> bool:
+        name = f"{self.experiment}: {name}"
+        measured, tolerance = _plain(measured), _plain(tolerance)
+        self.checks.append(
+            dict(name=name, expected=expected, measured=measured, tolerance=tolerance, source=source, ok=ok)
+        )
+        row = f"{name.split(': ', 1)[1]:58} {_short(expected):>26} {_short(measured):>26} {_short(tolerance):>12}"
+        print(row, " ok" if ok else " NOT OK", flush=True)
+        return ok
+
+
+def interval(successes: int, trials: int, z: float = 1.959964) -> tuple[float, float]:
+    """Wilson's 95 % confidence interval of a share."""
+    p, n = successes / trials, trials
+    centre = (p + z * z / (2 * n)) / (1 + z * z / n)
+    half = z / (1 + z * z / n) * float(np.sqrt(p * (1 - p) / n + z * z / (4 * n * n)))
+    return max(0.0, centre - half), min(1.0, centre + half)
+
+
+def _plain(a):
+    return a.tolist() if isinstance(a, (np.ndarray, np.generic, jax.Array)) else a
+
+
+def _short(a) -> str:
+    if isinstance(a, (list, tuple)):
+        text = ", ".join(_short(b) for b in a)
+        return text if len(text) <= 26 else f"{_short(a[0])} ... ({len(a)})"
+    return a if isinstance(a, str) else f"{a:.6g}" if isinstance(a, float) else str(a)
