@@ -14,7 +14,7 @@ import optax
 from tqdm.auto import tqdm
 
 from jaxatt import check
-from jaxatt.engine import BLOCK, System, _compiled, admit, block_log, block_scores, in_trace, raw_key
+from jaxatt.engine import BLOCK, System, admit, block_log, block_scores, compiled, raw_key, traced
 
 
 def sweep(system: System, params, scenarios, key, *, ticks: int, score: Callable, progress: bool | None = None):
@@ -34,10 +34,10 @@ def sweep(system: System, params, scenarios, key, *, ticks: int, score: Callable
     params, scenarios = admit(system, params, scenarios)
     key = raw_key(key)
     blocks = -(-n // BLOCK)
-    if in_trace() or not check.concrete((params, scenarios, key)):
+    if traced(params, scenarios, key):
         return _traced(system, score, ticks, params, scenarios, key, n, blocks)
     rows, layout = _packed(scenarios)
-    run = _compiled(_packed_scores, 4)
+    run = compiled(_packed_scores, 4)
     devices = jax.local_devices()
     at = [jax.device_put((params, key), device) for device in devices]
     under_way: deque = deque()
@@ -116,7 +116,7 @@ def rerun(system: System, params, scenarios, key, index: int, *, ticks: int):
     params, scenarios = admit(system, params, scenarios)
     block, lane = divmod(index, BLOCK)
     here = _lanes_of(jax.tree.map(np.asarray, scenarios), block)
-    return _compiled(block_log, 2)(system, ticks, params, here, raw_key(key), np.int32(block), np.int32(lane))
+    return compiled(block_log, 2)(system, ticks, params, here, raw_key(key), np.int32(block), np.int32(lane))
 
 
 class History(NamedTuple):
@@ -150,7 +150,7 @@ def tune(cost: Callable, theta, optimizer, steps: int, key, *, progress: bool | 
         updates = jax.tree.map(lambda u: factor * u, updates)
         return value, size, optax.apply_updates(theta, updates), state
 
-    step = _compiled(step, 0)
+    step = compiled(step, 0)
     state, factor = optimizer.init(theta), 1.0
     best = (np.inf, theta, state)
     trail = []
