@@ -87,7 +87,7 @@ def interval(successes: int, trials: int, z: float = 1.959964) -> tuple[float, f
 
 
 def _plain(a):
-    return a.tolist() if isinstance(a, (np.ndarray, np.generic, jax.Array)) else a
+    return a if isinstance(a, str) else np.asarray(a).tolist()
 
 
 def _short(a) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections import deque
 from collections.abc import Callable
 from math import prod
@@ -23,7 +24,7 @@ def sweep(system: System, params, scenarios, key, *, ticks: int, score: Callable
     scenarios: every leaf carries the n scenarios in its last axis; params none. Scenario i meets the noise
     ``noise_of(system, key, i, ticks)``; its result does not depend on n, bit for bit, nor on the number of
     devices. Blocks run one after the other on every local device, so memory does not grow with ticks and only
-    with the scores in n. progress: show a bar; None shows it once a sweep has run for two seconds.
+    with the scores in n. progress: show a bar; None shows it on terminals and in notebooks, after two seconds.
 
     Under jit, grad or vmap the same numbers come from one traced loop over the blocks.
 
@@ -42,7 +43,7 @@ def sweep(system: System, params, scenarios, key, *, ticks: int, score: Callable
     at = [jax.device_put((params, key), device) for device in devices]
     under_way: deque = deque()
     done: list = []
-    with tqdm(total=n, unit=" scenarios", disable=progress is False, delay=0 if progress else 2, leave=False) as bar:
+    with _bar(progress, n, " scenarios") as bar:
         for block in range(blocks + 2 * len(devices)):
             if block < blocks:
                 device = block % len(devices)
@@ -52,6 +53,13 @@ def sweep(system: System, params, scenarios, key, *, ticks: int, score: Callable
                 done.append(jax.tree.map(np.asarray, under_way.popleft()))
                 bar.update(min(BLOCK, n - (len(done) - 1) * BLOCK))
     return jax.tree.map(lambda *parts: np.concatenate(parts, axis=-1)[..., :n], *done)
+
+
+def _bar(progress: bool | None, total: int, unit: str):
+    """A progress bar; progress None: on a terminal or in a notebook, and after two seconds."""
+    seen = sys.stderr.isatty() or "ipykernel" in sys.modules
+    hidden = progress is False or (progress is None and not seen)
+    return tqdm(total=total, unit=unit, disable=hidden, delay=0 if progress else 2, leave=False)
 
 
 def _packed_scores(system, score, ticks, layout, params, key, rows, block):
@@ -144,17 +152,17 @@ def tune(cost: Callable, theta, optimizer, steps: int, key, *, progress: bool | 
     def step(theta, state, factor):
         value, gradient = jax.value_and_grad(cost)(theta, key)
         size = optax.global_norm(gradient)
-        updates, state = optimizer.update(gradient, state, theta, value=value, grad=gradient, value_fn=cost) if (
-            isinstance(optimizer, optax.GradientTransformationExtraArgs)
-        ) else optimizer.update(gradient, state, theta)
+        more = dict(value=value, grad=gradient, value_fn=lambda theta: cost(theta, key)) if line_search else {}
+        updates, state = optimizer.update(gradient, state, theta, **more)
         updates = jax.tree.map(lambda u: factor * u, updates)
         return value, size, optax.apply_updates(theta, updates), state
 
+    line_search = isinstance(optimizer, optax.GradientTransformationExtraArgs)
     step = compiled(step, 0)
     state, factor = optimizer.init(theta), 1.0
     best = (np.inf, theta, state)
     trail = []
-    with tqdm(total=steps, unit=" steps", disable=progress is False, delay=0 if progress else 2, leave=False) as bar:
+    with _bar(progress, steps, " steps") as bar:
         for _ in range(steps):
             value, size, ahead, ahead_state = step(theta, state, factor)
             value, size = float(value), float(size)

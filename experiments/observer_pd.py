@@ -1,0 +1,299 @@
+"""Yun & Kang (2020): sensor-fault detection by a nonlinear observer, tolerance by an adaptive PD law.
+
+The paper gives no fault signals, noise law or step sizes; the reference numbers are those of an independent
+implementation with the choices written down in `jaxatt.systems.observer_pd`. Figures 1-3 are compared with
+the paper's words about them.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+import optax
+
+from experiments.report import interval
+from jaxatt import Fault, Vec3, on_axes, rerun, scores, simulate, sweep, tune
+from jaxatt.attitude import mrp_matrix, mrp_rate, mrp_rate_transposed
+from jaxatt.bodies import body_acceleration
+from jaxatt.engine import rk4
+from jaxatt.estimators import AttitudeRate, mrp_observer
+from jaxatt.systems import observer_pd as op
+from jaxatt.vec import array, cross, inverse, norm, vec3
+
+HEALTHY = on_axes(Fault())
+QUIET = op.scenario._replace(star=HEALTHY, gyro=HEALTHY, std_q=0.0, std_w=0.0)
+FINE = op.system._replace(dt=0.01, substeps=1)  # the grid of the reference numbers
+ZERO = Vec3(0.0, 0.0, 0.0)
+KEY = jax.random.key(2020)
+SPEC = "independent implementation"
+
+
+def run(report) -> None:
+    """All checks and figures of the paper's loop."""
+    mathematics(report)
+    nominal(report)
+    figures(report)
+    monte_carlo(report)
+    fault_sizes(report)
+    tuning(report)
+
+
+def repeated(scenario, n: int):
+    """n copies of a scenario in the last axis."""
+    return jax.tree.map(lambda a: np.full(n, a), scenario)
+
+
+def mathematics(report) -> None:
+    """What must hold whatever the numbers are."""
+    rng = np.random.default_rng(1)
+    J, J_inv, alpha, beta = op.INERTIA, inverse(op.INERTIA), 1.1, 15.0
+
+    def draw(size=1.0):
+        return vec3(size * rng.normal(size=(3, 1000)))
+
+    for label, noise in (("clean", 0.0), ("noisy", 0.3)):
+        q, w, q_hat, w_hat, u, n_q, n_w = draw(), draw(), draw(), draw(), draw(), draw(noise), draw(noise)
+        y = AttitudeRate(q + n_q, w + n_w)
+        hat = mrp_observer(AttitudeRate(q_hat, w_hat), y, u, J, J_inv, alpha, beta)
+        e_q, e_w = q - q_hat, w - w_hat
+        dV = e_q @ (mrp_rate(q, w) - hat.q) + e_w @ (J @ (body_acceleration(w, u, J, J_inv) - hat.w))
+        exact = (
+            -alpha * (e_q @ e_q) - beta * (e_w @ e_w) - alpha * (e_q @ n_q) - beta * (e_w @ n_w)
+            - e_q @ (mrp_rate(y.q, w) - mrp_rate(q, w)) + e_w @ cross(w_hat, J @ n_w)
+            - e_w @ mrp_rate_transposed(y.q, n_q)
+        )  # fmt: skip
+        report.check(f"V' identity of the observer, {label} readings", 0, np.abs(dV - exact).max(), 1e-10, "V'; spec 5.3")
+
+    q = draw()
+    G = np.stack([array(mrp_rate(q, vec3([np.full(1000, a) for a in e]))) for e in np.eye(3)], axis=1)
+    excess = np.linalg.norm(np.moveaxis(G, -1, 0), 2, axis=(1, 2)) - (1 + np.asarray(q @ q)) / 4
+    report.check("|G(q)| - (1 + |q|^2)/4", 0, np.abs(excess).max(), 1e-12, "spec 5.5")
+
+    def flow(t, x):
+        return AttitudeRate(mrp_rate(x.q, x.w), body_acceleration(x.w, ZERO, J, J_inv))
+
+    start = jax.tree.map(jnp.asarray, AttitudeRate(ZERO, op.scenario.w))
+    end, _ = jax.lax.scan(lambda x, _: (rk4(flow, 0.0, x, 0.001), None), start, None, 20_000)
+    momentum = [mrp_matrix(x.q) @ (J @ x.w) for x in (start, end)]
+    drift = norm(momentum[1] - momentum[0]) / norm(momentum[0])
+    report.check("torque-free momentum drift, 20 s", 0, float(drift), 1e-9, "eq. (4), spec 5.1")
+
+    theta = jnp.log(jnp.array([1.1, 15.0, 330.0, 125.0]))
+    scenario = op.scenario._replace(q_hat=Vec3(0.35, 0.2, -0.6), gyro=on_axes(Fault(5.0, bias=0.02)))
+    loss = jax.jit(lambda theta: smooth_loss(theta, scenario))
+    gradient = jax.jit(jax.grad(loss))(theta)
+    central = np.array([(loss(theta + d) - loss(theta - d)) / 2e-5 for d in 1e-5 * np.eye(4)])
+    error = np.abs(np.asarray(gradient) / central - 1).max()
+    report.check("gradient against central difference, relative", 0, error, 1e-5, "alpha, beta, k_q, k_w0")
+
+
+def gains(theta):
+    """Params with the gains exp(theta) of (alpha, beta, k_q, k_w0)."""
+    alpha, beta, k_q, k_w0 = jnp.exp(theta)
+    return op.params._replace(alpha=alpha, beta=beta, k_q=k_q, k_w0=k_w0)
+
+
+def alarm_level(xi):
+    """A smooth stand-in of the alarm |xi| > 0.01."""
+    return jax.nn.sigmoid((xi - 0.01) / 0.001)
+
+
+def smooth_loss(theta, scenario):
+    """A smooth loss of one run of 15 s."""
+    log = simulate(op.system, gains(theta), scenario, KEY, ticks=150)
+    return jnp.mean(alarm_level(log.xi) + 20 * norm(log.e_q)) + 0.02 * jnp.sqrt(jnp.mean(log.u @ log.u))
+
+
+def last_outside(values, bound: float, dt: float) -> float:
+    """Last time at which a record exceeds a bound."""
+    return dt * float(np.max(np.flatnonzero(np.asarray(values) > bound)))
+
+
+def nominal(report) -> None:
+    """Runs without noise and faults."""
+    for sign, settling, label in ((-1.0, 5.22, "Euler"), (1.0, 5.31, "as printed")):
+        log = simulate(FINE, op.params._replace(sign=sign), QUIET._replace(sign=sign), KEY, ticks=1000)
+        name = f"|q| < 0.01 after [s], dynamics {label}"
+        report.check(name, settling, last_outside(norm(log.q), 0.01, 0.01) + 0.01, 0.02, SPEC)
+        if sign < 0:
+            report.check("peak |u| [N m]", 147.52, float(norm(log.u).max()), 0.01, SPEC)
+    log = simulate(FINE, op.params, QUIET._replace(q_hat=ZERO, w_hat=ZERO), KEY, ticks=1200)
+    report.check("observer from zero: |xi(0)|", 1.514188, float(log.xi[0]), 1e-6, SPEC)
+    report.check("observer from zero: last above sigma [s]", 8.86, last_outside(log.xi, 0.01, 0.01), 0.02, SPEC)
+    log = simulate(op.system, op.params._replace(eps=0.00304), QUIET, KEY, ticks=601)
+    report.check("k_w at 60 s, eps = 0.00304 [N m s]", 1.5726, float(log.k_w[-1]), 0.001, "eq. (19), spec 6")
+    report.within("least k_w of that run [N m s]", 1.5715, None, float(log.k_w.min()), "never below h(0)")
+    faults = QUIET._replace(star=on_axes(Fault(250.0, bias=0.03)), gyro=on_axes(Fault(150.0, bias=0.03)))
+    log = simulate(op.system, op.params, faults, KEY, ticks=3500)
+    name = "constant faults of 0.03: |xi| before, after 250 s"
+    report.relative(name, [0.0119, 0.0119], [float(log.xi[2490]), float(log.xi[-1])], 0.02, "spec 4")
+
+
+def marked(ax, ylabel: str) -> None:
+    """The paper's time axis with both fault onsets."""
+    for t, text in ((150, "gyro fault"), (250, "star-sensor fault")):
+        ax.axvline(t, color="0.5", linestyle=":")
+        ax.annotate(text, (t, 0.97), xycoords=("data", "axes fraction"), xytext=(4, 0), textcoords="offset points", va="top", color="0.3")
+    ax.set(xlabel="time [s]", ylabel=ylabel, xlim=(0, 350))
+
+
+def figures(report) -> None:
+    """Figures 1-3 of the paper, one run."""
+    log = rerun(op.system, op.params, repeated(op.scenario, 1), KEY, 0, ticks=3500)
+    t = op.DT * np.arange(3500)
+    fig, ax = plt.subplots(figsize=(7, 3.5))
+    ax.semilogy(t, log.xi, linewidth=0.6, label=r"residual norm $|\xi|$")
+    ax.axhline(op.params.sigma, color="C1", linestyle="--", label=r"threshold $\sigma$ = 0.01")
+    marked(ax, r"$|\xi|$ [MRP, rad/s]")
+    ax.legend(loc="lower left")
+    report.figure("fig1_residual", fig)
+    for name, error, ylabel in (("fig2_attitude_error", log.e_q, "attitude error [MRP]"), ("fig3_rate_error", log.e_w, "rate error [rad/s]")):
+        fig, ax = plt.subplots(figsize=(7, 3.5))
+        for axis, values in zip("xyz", error):
+            ax.plot(t, values, linewidth=0.6, label=axis)
+        marked(ax, ylabel)
+        limit = 1.3 * max(float(np.abs(a[t > 150]).max()) for a in error)
+        ax.set_ylim(-limit, limit)
+        ax.legend(loc="lower left", ncols=3, title="body axis; the slew of the first 10 s leaves the frame")
+        report.figure(name, fig)
+    alarms = np.asarray(log.alarm)
+    report.check("Fig. 1: alarm at the onset, share of 50-150 s", [1, 0], [alarms[1500], alarms[500:1500].mean()], 0, "words on Fig. 1")
+
+
+def windows(params, scenario, now, log):
+    """Mean squares of residual and errors, and the alarm share, in three windows."""
+    inside = [(now.t >= a) & (now.t < b) for a, b in ((60, 150), (150, 250), (250, 350))]
+    xi, q, w = log.xi**2, log.e_q @ log.e_q, log.e_w @ log.e_w
+    return [[scores.mean(a, i) for a in (xi, log.alarm, q, w)] for i in inside]
+
+
+def monte_carlo(report) -> None:
+    """The table of windows for both values of eps, random held faults of 0.03 per axis."""
+    n = 64 if report.quick else 256
+    table = {
+        0.1: [(0.001288, 0.0, 0.0001561, 0.001202), (0.05292, 0.992, 0.003395, 0.02626), (0.07514, 1.0, 0.01072, 0.08262)],
+        0.00304: [(0.001288, 0.0, 0.001184, 0.009374), (0.05292, 0.992, 0.001284, 0.01006), (0.07514, 1.0, 0.07812, 0.6194)],
+    }  # fmt: skip
+    for eps, rows in table.items():
+        system = op.system._replace(substeps=4 if eps == 0.1 else 8)
+        params = op.params._replace(eps=eps)
+        swept = sweep(system, params, repeated(op.scenario, n), KEY, ticks=3500, score=windows)
+        for span, (xi, share, q, w), got in zip(("60-150", "150-250", "250-350"), rows, swept):
+            rms = [float(np.sqrt(a.mean())) for a in (got[0], got[2], got[3])]
+            name = f"eps {eps}, {span} s: rms |xi|, |e_q|, |e_w|"
+            report.relative(name, [xi, q, w], rms, 0.03 if eps == 0.1 else 0.06, f"{SPEC}, {n} runs")
+            report.check(f"eps {eps}, {span} s: share above sigma", share, got[1].mean(), 0.002, f"{SPEC}, {n} runs")
+
+
+def fault_sizes(report) -> None:
+    """Detection delay and miss share over the size of held random faults and of constant biases."""
+    runs = 16 if report.quick else 128
+    sizes = {"gyro": np.geomspace(0.003, 0.1, 8), "star": np.geomspace(0.003, 0.1, 8)}
+    cases = [(sensor, kind, size) for sensor in sizes for kind in ("random", "bias") for size in sizes[sensor]]
+    cases += [("gyro", "bias", 0.0)] * 8
+    case = np.repeat(np.arange(len(cases)), runs)
+    column = lambda sensor, kind: np.array([s if (a, b) == (sensor, kind) else 0.0 for a, b, s in cases])[case]
+    n = len(case)
+    onset = np.random.default_rng(3).uniform(30, 40, n)
+    scenarios = repeated(QUIET._replace(std_q=op.STD_Q, std_w=op.STD_W), n)
+    fault = lambda sensor: on_axes(
+        jax.tree.map(lambda a: np.full(n, a), Fault())._replace(
+            onset=onset, random=column(sensor, "random"), bias=column(sensor, "bias")
+        )
+    )
+    scenarios = scenarios._replace(star=fault("star"), gyro=fault("gyro"))
+    swept = sweep(op.system, op.params, scenarios, jax.random.fold_in(KEY, 1), ticks=700, score=op.score)
+    by_case = jax.tree.map(lambda a: a.reshape(len(cases), runs), swept)
+    report.check("fault-size sweep: share of finite runs", 1, swept.ok.mean(), 0, f"{n} scenarios")
+    chance = np.isfinite(by_case.delay[-8:])
+    low, high = interval(int(chance.sum()), chance.size)
+    report.note(f"chance level, no fault: alarm within 30-40 s in {chance.mean():.4f} of runs (95 %: {low:.4f} to {high:.4f})")
+    fig, axes = plt.subplots(2, 2, figsize=(9, 6), sharex=True, sharey="row", layout="constrained")
+    for j, sensor in enumerate(("gyro", "star")):
+        for i, (kind, label) in enumerate((("random", "random, held"), ("bias", "constant bias"))):
+            rows = [k for k, c in enumerate(cases[:-8]) if c[:2] == (sensor, kind)]
+            size = np.array([cases[k][2] for k in rows])
+            delay = by_case.delay[rows]
+            found = np.isfinite(delay).sum(1)
+            share = np.array([interval(int(f), runs) for f in found])
+            miss = by_case.miss[rows]
+            axes[0, j].plot(size, found / runs, "os"[i] + "-", color=f"C{i}", label=label)
+            axes[0, j].fill_between(size, share[:, 0], share[:, 1], color=f"C{i}", alpha=0.2)
+            axes[1, j].plot(size, miss.mean(1), "os"[i] + "-", color=f"C{i}", label=label)
+            text = "  ".join(f"{s:.3g}: {np.median(d):.3g} s" for s, d in zip(size, delay))
+            report.note(f"{sensor}, {label}: size: median delay (inf: not found)  {text}")
+        axes[0, j].axhline(chance.mean(), color="0.5", linestyle=":", label="chance level")
+        axes[0, j].set(title=f"{sensor} fault".replace("star", "star-sensor"), ylabel="share of faults detected" if j == 0 else "")
+        axes[1, j].set(xlabel=f"size per axis [{'rad/s' if sensor == 'gyro' else 'MRP'}]", xscale="log", ylabel="share of faulty time without alarm" if j == 0 else "")
+        axes[0, j].legend()
+    report.figure("fault_sizes", fig)
+    loud = by_case.miss[[k for k, c in enumerate(cases) if c[0] == "gyro" and c[1] == "random" and c[2] > 0.09]]
+    report.within("miss share, random gyro fault of 0.1 rad/s", None, 0.01, loud.mean(), "ten times the threshold")
+    # A constant star-sensor bias is absorbed (DC gain 0), whatever its size: spec 4.
+    star = by_case.miss[[k for k, c in enumerate(cases) if c[0] == "star" and c[1] == "bias"]]
+    report.within("least miss share, constant star-sensor bias", 0.5, None, star.mean(1).min(), "DC gain 0, spec 4")
+
+
+def tuning_scenarios(n: int, seed: int):
+    """Slews of 60 s with a gyro bias at 20 s, a random star-sensor fault at 40 s, a wrong start of the observer."""
+    rng = np.random.default_rng(seed)
+    scenarios = repeated(op.scenario, n)
+    shaken = lambda v: Vec3(*(a + 0.05 * rng.normal(size=n) for a in v))
+    faults = lambda f: jax.tree.map(lambda a: np.full(n, a), on_axes(f))
+    return scenarios._replace(
+        q_hat=shaken(scenarios.q), w_hat=shaken(scenarios.w),
+        gyro=faults(Fault(20.0, bias=0.02)), star=faults(Fault(40.0, random=0.01)),
+    )  # fmt: skip
+
+
+def tuning_score(params, scenario, now, log):
+    """Soft alarms and tracking, the terms of the tuned cost, and the hard alarms by which it is judged."""
+    level = alarm_level(log.xi)
+    quiet, ill = (now.t >= 5) & (now.t < 20), now.t >= 20
+    return dict(
+        soft_false=scores.mean(level, quiet),
+        soft_miss=scores.mean(1 - level, ill),
+        post=scores.mean(norm(log.e_q), ill),
+        transient=scores.mean(norm(log.e_q), ~ill),
+        rms_u=scores.rms(log.u @ log.u),
+        miss=scores.mean(~log.alarm, ill),
+        false=scores.mean(log.alarm, (now.t >= 10) & ~ill),
+        early=scores.mean(log.alarm, (now.t >= 5) & (now.t < 10)),
+    )
+
+
+def tuning_cost(theta, key, scenarios, weight: float):
+    """The cost of the gains exp(theta): weight on soft false alarms."""
+    s = sweep(op.system, gains(theta), scenarios, key, ticks=600, score=tuning_score)
+    each = weight * s["soft_false"] + s["soft_miss"] + 20 * s["post"] + 2 * s["transient"] + 0.02 * s["rms_u"]
+    return jnp.mean(each)
+
+
+def tuning(report) -> None:
+    """Gains by gradient, judged on scenarios and noise that the search has not met."""
+    start = np.log([1.1, 15.0, 330.0, 125.0])
+    train = tuning_scenarios(128, 99)
+    cost = lambda theta, key: tuning_cost(theta, key, train, 100.0)
+    theta, history = tune(cost, start, optax.adam(0.05), 60, jax.random.fold_in(KEY, 2))
+    n = 128 if report.quick else 1024
+    fresh, key = tuning_scenarios(n, 123), jax.random.fold_in(KEY, 3)
+    before, after = (sweep(op.system, gains(t), fresh, key, ticks=600, score=tuning_score) for t in (start, theta))
+    report.note("tuned alpha, beta, k_q, k_w0: " + ", ".join(f"{a:.4g}" for a in np.exp(theta)))
+    for name in ("miss", "false", "early", "post", "transient", "rms_u"):
+        change = after[name] - before[name]
+        half = 1.96 * change.std(ddof=1) / np.sqrt(n)
+        report.note(f"{name:10} {before[name].mean():9.5f} -> {after[name].mean():9.5f}  paired change {change.mean():+.5f} +- {half:.5f}")
+    gain = lambda name: float(after[name].mean() / before[name].mean())
+    report.within("tuned / paper's gains, |e_q| after the fault", None, 0.75, gain("post"), f"{n} fresh scenarios")
+    report.within("tuned / paper's gains, rms torque", None, 0.85, gain("rms_u"), f"{n} fresh scenarios")
+    report.within("tuned: false alarms after 10 s", None, 0.001, float(after["false"].mean()), f"{n} fresh scenarios")
+    fig, (left, right) = plt.subplots(1, 2, figsize=(9, 3.5), layout="constrained")
+    left.plot(history.cost)
+    left.set(xlabel="step of the search", ylabel="cost on the training scenarios")
+    for name, values in zip((r"$\alpha$", r"$\beta$", "$k_q$", "$k_{w0}$"), np.exp(history.theta - start).T):
+        right.plot(values, label=name)
+    right.set(xlabel="step of the search", ylabel="gain / the paper's", yscale="log")
+    right.legend()
+    report.figure("tuning", fig)

@@ -1,0 +1,213 @@
+"""The paper's loop against the numbers of an independent implementation, and against its own mathematics."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxatt import Fault, on_axes, scores, simulate, sweep
+from jaxatt.attitude import mrp_matrix, mrp_rate, mrp_rate_transposed
+from jaxatt.bodies import body_acceleration
+from jaxatt.controllers import adapted_rate_gain, rate_gain_floor
+from jaxatt.engine import rk4
+from jaxatt.estimators import AttitudeRate, mrp_observer
+from jaxatt.systems import observer_pd as op
+from jaxatt.vec import Vec3, array, cross, inverse, norm, vec3
+
+HEALTHY = on_axes(Fault())
+QUIET = op.scenario._replace(star=HEALTHY, gyro=HEALTHY, std_q=0.0, std_w=0.0)
+FINE = op.system._replace(dt=0.01, substeps=1)  # ticks on the grid that the reference numbers are given on
+KEY = jax.random.key(0)
+RNG = np.random.default_rng(7)
+
+
+def lanes(scenario, n):
+    return jax.tree.map(lambda a: np.full(n, a), scenario)
+
+
+def last_outside(values, bound, dt):
+    return dt * np.max(np.flatnonzero(np.asarray(values) > bound))
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_the_lyapunov_identity_of_the_observer(sign):
+    """V' = -alpha |xi_q|^2 - beta |xi_w|^2 for clean readings; with noise the exact form of the spec, 5.3."""
+    n, J, J_inv, alpha, beta = 200, op.INERTIA, inverse(op.INERTIA), 1.1, 15.0
+    draw = lambda size=1.0: vec3(size * RNG.normal(size=(3, n)))
+    for noise in (0.0, 0.3):
+        q, w, q_hat, w_hat, u = (draw() for _ in range(5))
+        n_q, n_w = draw(noise), draw(noise)
+        y, estimate = AttitudeRate(q + n_q, w + n_w), AttitudeRate(q_hat, w_hat)
+        hat = mrp_observer(estimate, y, u, J, J_inv, alpha, beta, sign)
+        e_q, e_w = q - q_hat, w - w_hat
+        dV = e_q @ (mrp_rate(q, w) - hat.q) + e_w @ (J @ (body_acceleration(w, u, J, J_inv, sign) - hat.w))
+        dG_w = mrp_rate(y.q, w) - mrp_rate(q, w)
+        expected = (
+            -alpha * (e_q @ e_q) - beta * (e_w @ e_w) - alpha * (e_q @ n_q) - beta * (e_w @ n_w) - e_q @ dG_w
+            - sign * (e_w @ cross(w_hat, J @ n_w)) - e_w @ mrp_rate_transposed(y.q, n_q)
+        )  # fmt: skip
+        np.testing.assert_allclose(dV, expected, atol=1e-10)
+
+
+@pytest.mark.parametrize(("sign", "drift"), [(-1, 5.9e-12), (1, 0.948)])
+def test_momentum_is_conserved_by_eulers_sign_only(sign, drift):
+    J, J_inv = op.INERTIA, inverse(op.INERTIA)
+
+    def flow(t, x):
+        return AttitudeRate(mrp_rate(x.q, x.w), body_acceleration(x.w, Vec3(0.0, 0.0, 0.0), J, J_inv, sign))
+
+    momentum = lambda x: mrp_matrix(x.q) @ (J @ x.w)
+    step = jax.jit(lambda x, _: (rk4(flow, 0.0, x, 0.001), None))
+    start = AttitudeRate(Vec3(0.0, 0.0, 0.0), vec3(list(op.scenario.w)))
+    start = jax.tree.map(jnp.asarray, start)
+    end, _ = jax.lax.scan(step, start, None, 20_000)
+    change = float(norm(momentum(end) - momentum(start)) / norm(momentum(start)))
+    if sign < 0:
+        assert change < 1e-9
+    else:
+        assert change == pytest.approx(drift, rel=0.01)
+
+
+@pytest.mark.parametrize(("sign", "settling"), [(-1.0, 5.22), (1.0, 5.31)])
+def test_the_nominal_slew(sign, settling):
+    params, scenario = op.params._replace(sign=sign), QUIET._replace(sign=sign)
+    log = simulate(FINE, params, scenario, KEY, ticks=1000)
+    assert last_outside(norm(log.q), 0.01, 0.01) + 0.01 == pytest.approx(settling, abs=0.02)
+    assert norm(log.u).max() == pytest.approx(147.52, abs=0.01)
+
+
+def test_the_observer_from_zero():
+    zero = Vec3(0.0, 0.0, 0.0)
+    log = simulate(FINE, op.params, QUIET._replace(q_hat=zero, w_hat=zero), KEY, ticks=1200)
+    assert log.xi[0] == pytest.approx(1.514188, abs=1e-6)
+    assert last_outside(log.xi, 0.01, 0.01) == pytest.approx(8.86, abs=0.02)
+
+
+def test_the_rate_gain_lands_on_its_floor_and_never_below():
+    params = op.params._replace(eps=0.00304)
+    floor = float(rate_gain_floor(Vec3(0.0, 0.0, 0.0), 0.00304, 31.8566039))
+    assert floor == pytest.approx(1.5726, abs=1e-4)
+    for dt in (0.02, 0.05, 0.1):
+        log = simulate(op.system._replace(dt=dt), params, QUIET, KEY, ticks=round(60 / dt))
+        assert log.k_w[-1] == pytest.approx(1.5726, abs=0.001)
+        assert (log.k_w >= floor - 1e-9).all() and (jnp.diff(log.k_w) <= 0).all()
+
+
+def test_the_adaptation_step_is_the_solution_of_19():
+    e_q, e_w, eps, lam = Vec3(0.1, 0.2, -0.1), Vec3(0.05, 0.0, 0.1), 0.1, 31.86
+    h = rate_gain_floor(e_q, eps, lam)
+    c = eps * lam * norm(e_w) + 1 + e_q @ e_q
+    k_w = 125.0
+    for _ in range(1000):
+        k_w = rk4(lambda t, k: -c * c / (2 * eps * (k - h)), 0.0, k_w, 0.01)
+    assert adapted_rate_gain(125.0, e_q, e_w, eps, lam, 10.0) == pytest.approx(float(k_w), rel=1e-10)
+    assert adapted_rate_gain(125.0, e_q, e_w, eps, lam, 1e9) == pytest.approx(float(h), rel=1e-14)
+    assert adapted_rate_gain(1.0, e_q, e_w, eps, lam, 10.0) == 1.0  # below the floor it stays
+
+
+def windows(params, scenario, now, log):
+    """Tallies of the table of section 3 of the spec."""
+    inside = [(now.t >= a) & (now.t < b) for a, b in ((60, 150), (150, 250), (250, 350))]
+    qq, ww = log.e_q @ log.e_q, log.e_w @ log.e_w
+    return [(scores.mean(log.xi**2, i), scores.mean(log.alarm, i), scores.mean(qq, i), scores.mean(ww, i)) for i in inside]
+
+
+@pytest.mark.parametrize(
+    ("eps", "tolerance", "table"),
+    [
+        (0.1, 0.03, [(0.001288, 0, 0.0001561, 0.001202), (0.05292, 0.992, 0.003395, 0.02626), (0.07514, 1, 0.01072, 0.08262)]),
+        (0.00304, 0.06, [(0.001288, 0, 0.001184, 0.009374), (0.05292, 0.992, 0.001284, 0.01006), (0.07514, 1, 0.07812, 0.6194)]),
+    ],
+)  # fmt: skip
+def test_the_monte_carlo_table(eps, tolerance, table):
+    system = op.system._replace(substeps=4 if eps == 0.1 else 8)
+    swept = sweep(system, op.params._replace(eps=eps), lanes(op.scenario, 64), jax.random.key(21), ticks=3500, score=windows)
+    for got, (xi, share, q, w) in zip(swept, table):
+        rms = [np.sqrt(a.mean()) for a in (got[0], got[2], got[3])]
+        np.testing.assert_allclose(rms, [xi, q, w], rtol=tolerance)
+        assert got[1].mean() == pytest.approx(share, abs=0.002)
+
+
+def test_constant_faults_hide():
+    """Spec, 4: biases of 0.03 leave |xi| at 0.0119 before and after the second, with a dip below the threshold."""
+    scenario = QUIET._replace(star=on_axes(Fault(250.0, bias=0.03)), gyro=on_axes(Fault(150.0, bias=0.03)))
+    log = simulate(op.system, op.params, scenario, KEY, ticks=3500)
+    assert log.xi[2490] == pytest.approx(0.0119, rel=0.02) and log.xi[-1] == pytest.approx(0.0119, rel=0.02)
+    assert log.xi[2500:].min() < 0.01
+
+
+def smooth_loss(log_gains, scenario):
+    gains = jnp.exp(log_gains)
+    params = op.params._replace(alpha=gains[0], beta=gains[1], k_q=gains[2], k_w0=gains[3])
+    log = simulate(op.system, params, scenario, KEY, ticks=150)
+    soft = jax.nn.sigmoid((log.xi - 0.01) / 0.001)
+    return jnp.mean(soft) + 20 * jnp.mean(norm(log.e_q)) + 0.02 * jnp.sqrt(jnp.mean(log.u @ log.u))
+
+
+def test_gradients_equal_central_differences():
+    scenario = op.scenario._replace(q_hat=Vec3(0.35, 0.2, -0.6), gyro=on_axes(Fault(5.0, bias=0.02)))
+    theta = jnp.log(jnp.array([1.1, 15.0, 330.0, 125.0]))
+    loss = jax.jit(smooth_loss)
+    gradient = jax.jit(jax.grad(smooth_loss))(theta, scenario)
+    central = [(loss(theta + d, scenario) - loss(theta - d, scenario)) / 2e-5 for d in 1e-5 * np.eye(4)]
+    np.testing.assert_allclose(gradient, central, rtol=1e-5)
+
+
+def test_gradients_are_finite_at_rest():
+    zero = Vec3(0.0, 0.0, 0.0)
+    scenario = QUIET._replace(q=zero, w=zero, q_hat=zero, w_hat=zero)
+    everything = lambda params, scenario: sum(
+        jnp.sum(a) for a in jax.tree.leaves(simulate(op.system, params, scenario, KEY, ticks=12)) if a.dtype != bool
+    )
+    params, scenario = jax.tree.map(jnp.asarray, (op.params, scenario))
+    for gradient in jax.tree.leaves(jax.jit(jax.grad(everything, argnums=(0, 1)))(params, scenario)):
+        assert np.isfinite(gradient).all()
+
+
+def test_torque_saturation_holds_on_every_axis():
+    log = simulate(op.system, op.params._replace(u_max=1.0), QUIET, KEY, ticks=600)
+    assert np.abs(array(log.u)).max() == 1.0 and norm(log.q)[-1] < norm(log.q)[0]
+
+
+def test_the_shadow_set_keeps_a_tumbling_body_inside_the_unit_ball():
+    scenario = QUIET._replace(w=Vec3(0.0, 0.0, 3.0), w_hat=Vec3(0.0, 0.0, 3.0), q=Vec3(0.0, 0.0, 0.0), q_hat=Vec3(0.0, 0.0, 0.0))
+    log = simulate(op.system, op.params._replace(u_max=0.01), scenario, KEY, ticks=100)
+    assert norm(log.q).max() <= 1 and log.xi[1:].max() < 0.01
+
+
+def test_scores_of_a_run_with_known_answers():
+    start = QUIET._replace(gyro=on_axes(Fault(30.0, bias=0.2)))
+    swept = sweep(op.system, op.params, lanes(start, 2), KEY, ticks=500, score=op.score)
+    assert swept.delay[0] == 0 and swept.miss[0] < 0.05
+    assert swept.false_alarms[0] == 0 and swept.start_up_alarms[0] == 0
+    assert swept.settling[0] == pytest.approx(5.2, abs=0.11)
+    assert swept.peak_u[0] >= 147.52 and swept.rms_u_ill[0] < swept.rms_u[0]
+
+
+J_FLAT = op.INERTIA._replace(z=Vec3(-1.0, 3.0, -10.0))
+
+
+@pytest.mark.parametrize(
+    ("params", "scenario", "message"),
+    [
+        (dict(J=J_FLAT), {}, r"`params.J` must be positive definite, but its smallest principal moment is -10\.\d+ kg m\^2"),
+        ({}, dict(J=J_FLAT), r"`scenario.J` must be positive definite"),
+        (dict(J=op.INERTIA._replace(x=Vec3(15.0, 9.0, -1.0))), {}, "symmetric"),
+        (dict(alpha=-1.0), {}, r"`params.alpha` must be a positive number, but it is -1\."),
+        (dict(k_q=0.0), {}, r"`params.k_q` must be a positive number, but it is 0\."),
+        (dict(k_w0=np.nan), {}, r"`params.k_w0` must be a positive number, but it is nan\."),
+        (dict(sigma=0.0), {}, r"`params.sigma` must be a positive number, but it is 0\."),
+        (dict(eps=0.4), {}, r"`params.eps` must lie in \(0, 0.354348\).*but it is 0.4"),
+        (dict(eps=0.0), {}, r"`params.eps` must lie in \(0, 0.354348\).*but it is 0"),
+        (dict(u_max=0.0), {}, r"`params.u_max` must be greater than 0"),
+        (dict(sign=0.5), {}, r"`params.sign` must be one of \(-1, 1\), but it is 0.5"),
+        ({}, dict(q=Vec3(np.nan, 0.0, 0.0)), r"`scenario.q.x` must be finite, but it is nan"),
+        ({}, dict(std_q=-1.0), r"`scenario.std_q` must not be negative, but it is -1"),
+        ({}, dict(gyro=on_axes(Fault(onset=np.nan))), r"`scenario.gyro.x.onset` must be a number, but it is nan"),
+        (dict(q_d=Vec3(np.inf, 0.0, 0.0)), {}, r"`params.q_d.x` must be finite, but it is inf"),
+    ],
+)
+def test_bad_input_is_refused(params, scenario, message):
+    with pytest.raises(ValueError, match=message) as refusal:
+        simulate(op.system, op.params._replace(**params), op.scenario._replace(**scenario), KEY, ticks=3)
+    assert "\n" not in str(refusal.value)
