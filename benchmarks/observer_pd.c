@@ -16,6 +16,8 @@
 #define AXES 3
 #define CHANNELS 6
 #define SCORES 15
+#define START_UP 20 /* [s] */
+#define BAND 0.01 /* of settling, MRP */
 #define INLINE static inline __attribute__((always_inline))
 
 typedef REAL V __attribute__((vector_size(64)));
@@ -30,13 +32,15 @@ typedef struct { V xx, xy, xz, yy, yz, zz; } Sym; /* a symmetric matrix */
 typedef struct { REAL x, y, z; } Row;
 typedef struct { Vec q, w, qh, wh; } X; /* continuous state: truth and observer */
 
-/* vectors */
+/* vectors; gcc makes one instruction of each of these loops */
+
+#define EACH _Pragma("GCC unroll 1") for (int i = 0; i < LANES; i++)
 
 INLINE V all(REAL a) { return (V){0} + a; }
-INLINE V pick(M m, V a, V b) { return (V)((m & (M)a) | (~m & (M)b)); }
-INLINE V largest(V a, V b) { return pick(a > b, a, b); }
-INLINE V smallest(V a, V b) { return pick(a < b, a, b); }
-INLINE V root(V a) { for (int i = 0; i < LANES; i++) a[i] = IS_FLOAT ? sqrtf(a[i]) : sqrt(a[i]); return a; }
+INLINE V pick(M m, V a, V b) { EACH a[i] = m[i] ? a[i] : b[i]; return a; }
+INLINE V largest(V a, V b) { EACH a[i] = a[i] > b[i] ? a[i] : b[i]; return a; }
+INLINE V smallest(V a, V b) { EACH a[i] = a[i] < b[i] ? a[i] : b[i]; return a; }
+INLINE V root(V a) { EACH a[i] = IS_FLOAT ? sqrtf(a[i]) : sqrt(a[i]); return a; }
 INLINE V size(V a) { return largest(a, -a); }
 INLINE V dot(Vec a, Vec b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
 INLINE Vec plus(Vec a, Vec b) { return (Vec){a.x + b.x, a.y + b.y, a.z + b.z}; }
@@ -55,6 +59,8 @@ INLINE Sym inverse(const Sym *m) {
     return (Sym){d * xx, d * xy, d * xz, d * (m->xx * m->zz - m->xz * m->xz), d * (m->xy * m->xz - m->xx * m->yz),
                  d * (m->xx * m->yy - m->xy * m->xy)};
 }
+
+INLINE Sym scaled(V s, Sym m) { return (Sym){s * m.xx, s * m.xy, s * m.xz, s * m.yy, s * m.yz, s * m.zz}; }
 
 /* exp(a) for a <= 0 */
 INLINE V decay(V a) {
@@ -98,7 +104,7 @@ static Generator seeded(uint64_t seed) {
     return g;
 }
 
-INLINE F rootf(F a) { for (int i = 0; i < LANES; i++) a[i] = sqrtf(a[i]); return a; }
+INLINE F rootf(F a) { EACH a[i] = sqrtf(a[i]); return a; }
 
 /* two standard normal numbers per lane, single precision */
 INLINE void two_normals(Generator *g, F *a, F *b) {
@@ -126,19 +132,17 @@ INLINE void two_normals(Generator *g, F *a, F *b) {
     *b = r * (c * q + 1);
 }
 
-/* attitude */
+/* attitude; every product goes with a sum into one instruction, so sums are written from the right */
 
-/* factor that takes n / d, an MRP, to its inner representative: 1 / d, or -d / |n|^2 */
-INLINE V inner_ratio(V nn, V d) {
-    M inner = nn <= d * d;
-    return pick(inner, all(1), -d) / pick(inner, d, nn);
+/* a x b + c */
+INLINE Vec cross_plus(Vec a, Vec b, Vec c) {
+    return (Vec){a.y * b.z - (a.z * b.y - c.x), a.z * b.x - (a.x * b.z - c.y), a.x * b.y - (a.y * b.x - c.z)};
 }
-/* G(q) w, times 4 */
-INLINE Vec rate4(V qq, Vec q, Vec w) {
-    Vec c = cross(q, w);
-    V a = 1 - qq, b = 2 * dot(q, w);
-    return (Vec){a * w.x + (2 * c.x + b * q.x), a * w.y + (2 * c.y + b * q.y), a * w.z + (2 * c.z + b * q.z)};
+/* a v + b w + c */
+INLINE Vec sum_plus(V a, Vec v, V b, Vec w, Vec c) {
+    return (Vec){a * v.x + (b * w.x + c.x), a * v.y + (b * w.y + c.y), a * v.z + (b * w.z + c.z)};
 }
+INLINE Vec twice(Vec a) { return plus(a, a); }
 
 /* the loop */
 
@@ -149,64 +153,80 @@ typedef struct { /* params, in the order of the leaves of observer_pd.Params, th
 typedef struct { V onset, end, bias, drift, rate, spread, std, scale; M stuck; } Fault; /* one channel */
 
 typedef struct { /* what stays during a run of one vector of lanes */
-    Sym J, J_inv, Jh, Jh_inv;
-    V sign, signh, alpha, beta, k_q, u_max, pp;
+    Sym J4, J_inv4, Jh4, Jh_inv4; /* 4 J with the sign of w x J w, its inverse without; of the observer */
+    V alpha4, beta4, k4_q, u4_max, pp;
     Vec p, w_d; /* p = -q_d */
     REAL h;
 } Plant;
 
-typedef struct { V gain[CHANNELS], offset[CHANNELS], k_w; } Hold; /* what stays during a tick */
+typedef struct { V gain[CHANNELS], offset[CHANNELS], k_w, k4_w; Vec wanted; } Hold; /* what stays during a tick */
 
-INLINE Vec error(const Plant *c, V qq, Vec q) {
-    Vec n = cross(c->p, q);
-    V a = 1 - qq, b = 1 - c->pp;
-    n = (Vec){a * c->p.x + (b * q.x + 2 * n.x), a * c->p.y + (b * q.y + 2 * n.y), a * c->p.z + (b * q.z + 2 * n.z)};
-    return times(inner_ratio(dot(n, n), 1 + (c->pp * qq - 2 * dot(c->p, q))), n);
+typedef struct { /* what a sweep keeps: sums, counts, extremes */
+    V delay, start_alarms, start_ticks, false_alarms, false_ticks, missed, ill_ticks, sum_q, sum_w, sum_u, ill_q, ill_w,
+        ill_u, peak_q, peak_w, peak_u, outside, end;
+    M ok;
+} Tally;
+
+typedef struct { Plant c; Hold z; X x; Fault fault[CHANNELS]; V onset, y[CHANNELS]; Generator g; Tally s; } Loop;
+
+typedef struct { Vec n; V ratio; } Error; /* e_q = ratio n */
+
+/* MRP product of p and q, inner representative. With d the denominator, |n|^2 = d ((1 + pp) (1 + qq) - d). */
+INLINE Error error(const Plant *c, V qq, Vec q) {
+    V a = 1 - qq, b = 1 - c->pp, e = 1 + c->pp;
+    Vec p2 = twice(c->p);
+    Vec n = cross_plus(p2, q, (Vec){a * c->p.x + b * q.x, a * c->p.y + b * q.y, a * c->p.z + b * q.z});
+    V d = (c->pp * qq + 1) - p2.x * q.x - p2.y * q.y - p2.z * q.z;
+    V other = d - (e * qq + e);
+    return (Error){n, 1 / pick(other + d >= 0, d, other)};
 }
 
 INLINE V clipped(V a, V limit) { return largest(smallest(a, limit), -limit); }
 
-INLINE Vec torque(const Plant *c, V k_w, Vec e_q, Vec e_w) {
-    return (Vec){clipped(-(c->k_q * e_q.x) - k_w * e_w.x, c->u_max), clipped(-(c->k_q * e_q.y) - k_w * e_w.y, c->u_max),
-                 clipped(-(c->k_q * e_q.z) - k_w * e_w.z, c->u_max)};
+/* 4 u, at a rate reading w */
+INLINE Vec torque4(const Plant *c, const Hold *z, Error e, Vec w) {
+    V k = c->k4_q * e.ratio;
+    return (Vec){clipped(z->wanted.x - k * e.n.x - z->k4_w * w.x, c->u4_max),
+                 clipped(z->wanted.y - k * e.n.y - z->k4_w * w.y, c->u4_max),
+                 clipped(z->wanted.z - k * e.n.z - z->k4_w * w.z, c->u4_max)};
 }
 
+/* dx/dt, of the attitudes four times that */
 INLINE X flow(const Plant *c, const Hold *z, X x) {
     Vec yq = {z->gain[0] * x.q.x + z->offset[0], z->gain[1] * x.q.y + z->offset[1], z->gain[2] * x.q.z + z->offset[2]};
     Vec yw = {z->gain[3] * x.w.x + z->offset[3], z->gain[4] * x.w.y + z->offset[4], z->gain[5] * x.w.z + z->offset[5]};
-    V yy = dot(yq, yq);
-    Vec u = torque(c, z->k_w, error(c, yy, yq), minus(yw, c->w_d));
-    Vec gyroscopic = cross(x.w, apply(&c->J, x.w));
-    Vec xi_q = minus(yq, x.qh), xi_w = minus(yw, x.wh);
-    Vec dw = apply(&c->J_inv, plus(times(c->sign, gyroscopic), u));
-    Vec back = cross(xi_q, yq); /* G(-q) = G(q)' */
-    V a = (REAL)0.25 * (1 - yy), b = (REAL)0.5 * dot(yq, xi_q);
-    Vec m = cross(x.wh, apply(&c->Jh, yw));
-    m = (Vec){
-        c->signh * m.x + (u.x + (c->beta * xi_w.x + (a * xi_q.x + ((REAL)0.5 * back.x + b * yq.x)))),
-        c->signh * m.y + (u.y + (c->beta * xi_w.y + (a * xi_q.y + ((REAL)0.5 * back.y + b * yq.y)))),
-        c->signh * m.z + (u.z + (c->beta * xi_w.z + (a * xi_q.z + ((REAL)0.5 * back.z + b * yq.z)))),
-    };
-    Vec dq = times(all(0.25), rate4(dot(x.q, x.q), x.q, x.w));
-    Vec dqh = plus(times(all(0.25), rate4(yy, yq, x.wh)), times(c->alpha, xi_q));
-    return (X){dq, dw, dqh, apply(&c->Jh_inv, m)};
+    Vec xi_q = minus(yq, x.qh), xi_w = minus(yw, x.wh), y2 = twice(yq), q2 = twice(x.q);
+    V yy = dot(yq, yq), a = 1 - yy;
+    Vec u4 = torque4(c, z, error(c, yy, yq), yw);
+    Vec m = {c->beta4 * xi_w.x + u4.x, c->beta4 * xi_w.y + u4.y, c->beta4 * xi_w.z + u4.z};
+    m = cross_plus(x.wh, apply(&c->Jh4, yw), m);
+    m = cross_plus(xi_q, y2, sum_plus(a, xi_q, dot(y2, xi_q), yq, m));
+    Vec dqh = cross_plus(y2, x.wh, sum_plus(a, x.wh, dot(y2, x.wh), yq, times(c->alpha4, xi_q)));
+    V a_q = 1 - dot(x.q, x.q), b_q = dot(x.q, x.w);
+    Vec dq = cross_plus(q2, x.w, (Vec){a_q * x.w.x + b_q * q2.x, a_q * x.w.y + b_q * q2.y, a_q * x.w.z + b_q * q2.z});
+    return (X){dq, apply(&c->J_inv4, cross_plus(x.w, apply(&c->J4, x.w), u4)), dqh, apply(&c->Jh_inv4, m)};
 }
 
 INLINE X ahead(X x, REAL h, X k) {
-    return (X){plus(x.q, times(all(h), k.q)), plus(x.w, times(all(h), k.w)), plus(x.qh, times(all(h), k.qh)),
-               plus(x.wh, times(all(h), k.wh))};
+    V h1 = all(h), h4 = all(h / 4);
+    return (X){plus(x.q, times(h4, k.q)), plus(x.w, times(h1, k.w)), plus(x.qh, times(h4, k.qh)),
+               plus(x.wh, times(h1, k.wh))};
+}
+INLINE X added(X a, X b) {
+    return (X){plus(a.q, b.q), plus(a.w, b.w), plus(a.qh, b.qh), plus(a.wh, b.wh)};
 }
 
-INLINE X rk4(const Plant *c, const Hold *z, X x) {
-    REAL h = c->h;
-    X k = flow(c, z, x);
-    X sum = ahead(x, h / 6, k);
-    k = flow(c, z, ahead(x, h / 2, k));
-    sum = ahead(sum, h / 3, k);
-    k = flow(c, z, ahead(x, h / 2, k));
-    sum = ahead(sum, h / 3, k);
-    k = flow(c, z, ahead(x, h, k));
-    return ahead(sum, h / 6, k);
+/* one step of several vectors side by side: the processor fills the waits of one with the work of the other */
+INLINE void rk4(Loop *l, int side) {
+    X k1[2], k2[2], k3[2];
+    for (int j = 0; j < side; j++) k1[j] = flow(&l[j].c, &l[j].z, l[j].x);
+    for (int j = 0; j < side; j++) k2[j] = flow(&l[j].c, &l[j].z, ahead(l[j].x, l[j].c.h / 2, k1[j]));
+    for (int j = 0; j < side; j++) k3[j] = flow(&l[j].c, &l[j].z, ahead(l[j].x, l[j].c.h / 2, k2[j]));
+    for (int j = 0; j < side; j++) {
+        REAL h = l[j].c.h;
+        X ends = added(k1[j], flow(&l[j].c, &l[j].z, ahead(l[j].x, h, k3[j])));
+        l[j].x = ahead(ahead(l[j].x, h / 3, added(k2[j], k3[j])), h / 6, ends);
+    }
 }
 
 INLINE V load(const REAL *from) { V a; memcpy(&a, from, sizeof a); return a; }
@@ -214,150 +234,178 @@ INLINE V count(M m) { return pick(m, all(1), all(0)); }
 INLINE V kept(M m, V a) { return (V)(m & (M)a); }
 INLINE V mean(V total, V ticks) { return pick(ticks == 0, all(NAN), total / ticks); }
 
-/* one vector of lanes; normals: NULL, or those of these lanes, (ticks, 6, n); drawn: draw them */
-static inline __attribute__((always_inline)) void run(
-    const Params *params, const REAL *scenario, const REAL *normals, int drawn, uint64_t seed, long n, long ticks,
-    int substeps, REAL dt, REAL *out) {
+static const REAL never = -INFINITY;
+
+INLINE void begin(Loop *l, const Params *params, const REAL *scenario, uint64_t seed, long n, int substeps, REAL dt) {
     const REAL *leaf = scenario;
 #define NEXT (leaf += n, load(leaf - n))
-#define NEXT_VEC {NEXT, NEXT, NEXT}
-    X x = {NEXT_VEC, NEXT_VEC, NEXT_VEC, NEXT_VEC};
-    V m[9];
+    V *x = (V *)&l->x, m[9];
+    for (int i = 0; i < 12; i++) x[i] = NEXT;
     for (int i = 0; i < 9; i++) m[i] = NEXT;
-    Plant c = {.J = {m[0], m[1], m[2], m[4], m[5], m[8]}};
+    Plant *c = &l->c;
+    c->J4 = scaled(all(4), (Sym){m[0], m[1], m[2], m[4], m[5], m[8]});
     for (int i = 0; i < 9; i++) m[i] = all(params->J[i]);
-    c.Jh = (Sym){m[0], m[1], m[2], m[4], m[5], m[8]};
-    c.J_inv = inverse(&c.J);
-    c.Jh_inv = inverse(&c.Jh);
-    c.sign = NEXT;
-    c.signh = all(params->sign);
-    c.alpha = all(params->alpha);
-    c.beta = all(params->beta);
-    c.k_q = all(params->k_q);
-    c.u_max = all(params->u_max);
-    c.p = (Vec){all(-params->q_d[0]), all(-params->q_d[1]), all(-params->q_d[2])};
-    c.pp = dot(c.p, c.p);
-    c.w_d = (Vec){all(params->w_d[0]), all(params->w_d[1]), all(params->w_d[2])};
-    c.h = dt / substeps;
-    V std_q = NEXT, std_w = NEXT, onset = all(INFINITY);
-    Fault fault[CHANNELS];
+    c->Jh4 = scaled(all(4), (Sym){m[0], m[1], m[2], m[4], m[5], m[8]});
+    c->J_inv4 = inverse(&c->J4);
+    c->Jh_inv4 = inverse(&c->Jh4);
+    c->J4 = scaled(NEXT, c->J4);
+    c->Jh4 = scaled(all(params->sign), c->Jh4);
+    c->alpha4 = all(4 * params->alpha);
+    c->beta4 = all(4 * params->beta);
+    c->k4_q = all(4 * params->k_q);
+    c->u4_max = all(4 * params->u_max);
+    c->p = (Vec){all(-params->q_d[0]), all(-params->q_d[1]), all(-params->q_d[2])};
+    c->pp = dot(c->p, c->p);
+    c->w_d = (Vec){all(params->w_d[0]), all(params->w_d[1]), all(params->w_d[2])};
+    c->h = dt / substeps;
+    V std_q = NEXT, std_w = NEXT;
+    l->onset = all(INFINITY);
     for (int i = 0; i < CHANNELS; i++) {
-        Fault *f = &fault[i];
+        Fault *f = &l->fault[i];
         f->onset = NEXT, f->end = NEXT, f->bias = NEXT, f->drift = NEXT, f->rate = -1 / NEXT;
         V random = NEXT;
         f->scale = NEXT, f->std = i < AXES ? std_q : std_w;
         V grown = NEXT * f->std;
         f->spread = root(grown * grown + random * random), f->stuck = NEXT > 0;
-        onset = smallest(onset, f->onset);
+        l->onset = smallest(l->onset, f->onset);
+        l->y[i] = x[i];
     }
-    Generator g = seeded(seed);
-    Hold z = {.k_w = all(params->k_w0)};
-    V y[CHANNELS] = {x.q.x, x.q.y, x.q.z, x.w.x, x.w.y, x.w.z};
-    const REAL lambda = params->eps * params->lambda_max, never = -INFINITY, start_up = 20, band = 0.01 * 0.01;
-    V delay = all(INFINITY), start_total = {0}, start_ticks = {0}, false_total = {0}, false_ticks = {0};
-    V miss_total = {0}, ill_ticks = {0}, sum_q = {0}, sum_w = {0}, sum_u = {0}, ill_q = {0}, ill_w = {0}, ill_u = {0};
-    V peak_q = all(never), peak_w = all(never), peak_u = all(never), outside = all(never), end = all(never);
-    M ok = ~(M){0};
+#undef NEXT
+    l->g = seeded(seed);
+    l->z.k_w = all(params->k_w0);
+    l->s = (Tally){.delay = all(INFINITY), .peak_q = all(never), .peak_w = all(never), .peak_u = all(never),
+                   .outside = all(never), .end = all(never), .ok = ~(M){0}};
+}
 
-    for (long k = 0; k < ticks; k++) {
-        V t = all((REAL)k * dt);
-        x.q = times(inner_ratio(dot(x.q, x.q), all(1)), x.q);
+INLINE void tick(Loop *l, const Params *params, const REAL *normals, int drawn, long k, REAL dt, long n) {
+    const Plant *c = &l->c;
+    Hold *z = &l->z;
+    Tally *s = &l->s;
+    X x = l->x;
+    V t = all((REAL)k * dt);
+    V outside = dot(x.q, x.q);
+    x.q = times(1 / pick(outside > 1, -outside, all(1)), x.q);
 
-        /* sense */
-        V noise[CHANNELS] = {0};
-        if (normals)
-            for (int i = 0; i < CHANNELS; i++) noise[i] = load(normals + (k * CHANNELS + i) * n);
-        if (drawn)
-            for (int i = 0; i < CHANNELS; i += 2) {
-                F a, b;
-                two_normals(&g, &a, &b);
-                noise[i] = __builtin_convertvector(a, V);
-                noise[i + 1] = __builtin_convertvector(b, V);
-            }
-        V truth[CHANNELS] = {x.q.x, x.q.y, x.q.z, x.w.x, x.w.y, x.w.z};
-        M ill = {0};
-        for (int i = 0; i < CHANNELS; i++) {
-            const Fault *f = &fault[i];
-            M on = (t >= f->onset) & (t < f->end), stuck = on & f->stuck;
-            V faulty = f->bias + (f->drift - f->drift * decay(kept(on, t - f->onset) * f->rate)) + f->spread * noise[i];
-            z.gain[i] = kept(~stuck, pick(on, f->scale, all(1)));
-            z.offset[i] = pick(stuck, y[i], pick(on, faulty, f->std * noise[i]));
-            y[i] = z.gain[i] * truth[i] + z.offset[i];
-            ill |= on;
+    /* sense */
+    V noise[CHANNELS] = {0};
+    if (normals)
+        for (int i = 0; i < CHANNELS; i++) noise[i] = load(normals + (k * CHANNELS + i) * n);
+    if (drawn)
+        for (int i = 0; i < CHANNELS; i += 2) {
+            F a, b;
+            two_normals(&l->g, &a, &b);
+            noise[i] = __builtin_convertvector(a, V);
+            noise[i + 1] = __builtin_convertvector(b, V);
         }
-        Vec yq = {y[0], y[1], y[2]}, yw = {y[3], y[4], y[5]};
-
-        /* decide */
-        V hh = dot(x.qh, x.qh);
-        M near = hh - 1 <= 2 * dot(x.qh, yq); /* |qh - y| <= |shadow - y|, multiplied out */
-        x.qh = times(pick(near, all(1), -1 / hh), x.qh);
-        Vec xi_q = minus(yq, x.qh), xi_w = minus(yw, x.wh);
-        V xi = root(dot(xi_q, xi_q) + dot(xi_w, xi_w));
-        M alarm = ~(xi <= params->sigma);
-        Vec ey = error(&c, dot(yq, yq), yq), ew = minus(yw, c.w_d);
-        V ee = dot(ey, ey);
-        V floor = lambda / 4 * (3 + 2 * root(ee) + 3 * ee) + (REAL)1.5;
-        V rate = lambda * root(dot(ew, ew)) + 1 + ee, s = z.k_w - floor;
-        V elapsed = all(k > 0 ? dt / params->eps : 0);
-        z.k_w = pick(s > 0, floor + root(largest(s * s - rate * rate * elapsed, all(0))), z.k_w);
-        Vec u = torque(&c, z.k_w, ey, ew);
-
-        /* score */
-        Vec e_q = error(&c, dot(x.q, x.q), x.q), e_w = minus(x.w, c.w_d);
-        M before = t < onset, start = t < start_up;
-        V qq = dot(e_q, e_q), ww = dot(e_w, e_w), uu = dot(u, u);
-        delay = smallest(delay, pick(alarm & ~before, t - onset, all(INFINITY)));
-        M early = start & before, later = ~start & before;
-        start_ticks += count(early), start_total += count(early & alarm);
-        false_ticks += count(later), false_total += count(later & alarm);
-        ill_ticks += count(ill), miss_total += count(ill & ~alarm);
-        sum_q += qq, sum_w += ww, sum_u += uu;
-        ill_q += kept(ill, qq), ill_w += kept(ill, ww), ill_u += kept(ill, uu);
-        peak_q = pick(start, peak_q, largest(peak_q, qq)); /* squares; the root is taken at the end */
-        peak_w = pick(start, peak_w, largest(peak_w, ww));
-        peak_u = largest(peak_u, uu);
-        end = pick(before, t, end);
-        outside = pick(before & (qq > band), t, outside);
-        V sum = qq + ww + uu + xi + z.k_w + (x.q.x + x.q.y + x.q.z + x.w.x + x.w.y + x.w.z);
-        ok &= size(sum) < INFINITY;
-
-        for (int i = 0; i < substeps; i++) x = rk4(&c, &z, x);
+    V truth[CHANNELS] = {x.q.x, x.q.y, x.q.z, x.w.x, x.w.y, x.w.z}, *y = l->y;
+    M ill = {0};
+    for (int i = 0; i < CHANNELS; i++) {
+        const Fault *f = &l->fault[i];
+        M on = (t >= f->onset) & (t < f->end), stuck = on & f->stuck;
+        V drift = f->drift - f->drift * decay(kept(on, t - f->onset) * f->rate);
+        z->gain[i] = kept(~stuck, pick(on, f->scale, all(1)));
+        z->offset[i] = pick(stuck, y[i], pick(on, f->bias + drift + f->spread * noise[i], f->std * noise[i]));
+        y[i] = z->gain[i] * truth[i] + z->offset[i];
+        ill |= on;
     }
-    V all_ticks = all(ticks), settled = pick(outside == end, all(INFINITY), largest(outside, all(0)));
+    Vec yq = {y[0], y[1], y[2]}, yw = {y[3], y[4], y[5]};
+
+    /* decide */
+    V hh = dot(x.qh, x.qh);
+    M near = hh - 1 <= 2 * dot(x.qh, yq); /* |qh - y| <= |shadow - y|, multiplied out */
+    x.qh = times(pick(near, all(1), -1 / hh), x.qh);
+    Vec xi_q = minus(yq, x.qh), xi_w = minus(yw, x.wh);
+    V xi = root(dot(xi_q, xi_q) + dot(xi_w, xi_w));
+    M alarm = ~(xi <= params->sigma);
+    Error ey = error(c, dot(yq, yq), yq);
+    Vec ew = minus(yw, c->w_d);
+    V ee = ey.ratio * ey.ratio * dot(ey.n, ey.n);
+    REAL lambda = params->eps * params->lambda_max;
+    V floor = lambda / 4 * (3 + 2 * root(ee) + 3 * ee) + (REAL)1.5;
+    V rate = lambda * root(dot(ew, ew)) + 1 + ee, above = z->k_w - floor;
+    V elapsed = all(k > 0 ? dt / params->eps : 0);
+    z->k_w = pick(above > 0, floor + root(largest(above * above - rate * rate * elapsed, all(0))), z->k_w);
+    z->k4_w = 4 * z->k_w;
+    z->wanted = times(z->k4_w, c->w_d);
+    Vec u4 = torque4(c, z, ey, yw);
+
+    /* score */
+    Error e_q = error(c, dot(x.q, x.q), x.q);
+    Vec e_w = minus(x.w, c->w_d);
+    M before = t < l->onset, start = t < (REAL)START_UP, early = start & before, later = ~start & before;
+    V qq = e_q.ratio * e_q.ratio * dot(e_q.n, e_q.n), ww = dot(e_w, e_w), uu = dot(u4, u4) / 16;
+    s->delay = smallest(s->delay, pick(alarm & ~before, t - l->onset, all(INFINITY)));
+    s->start_ticks += count(early), s->start_alarms += count(early & alarm);
+    s->false_ticks += count(later), s->false_alarms += count(later & alarm);
+    s->ill_ticks += count(ill), s->missed += count(ill & ~alarm);
+    s->sum_q += qq, s->sum_w += ww, s->sum_u += uu;
+    s->ill_q += kept(ill, qq), s->ill_w += kept(ill, ww), s->ill_u += kept(ill, uu);
+    s->peak_q = pick(start, s->peak_q, largest(s->peak_q, qq)); /* squares; the root is taken at the end */
+    s->peak_w = pick(start, s->peak_w, largest(s->peak_w, ww));
+    s->peak_u = largest(s->peak_u, uu);
+    s->end = pick(before, t, s->end);
+    s->outside = pick(before & (qq > (REAL)(BAND * BAND)), t, s->outside);
+    V log = qq + ww + uu + xi + z->k_w + (x.q.x + x.q.y + x.q.z + x.w.x + x.w.y + x.w.z);
+    s->ok &= size(log) < INFINITY;
+    l->x = x;
+}
+
+INLINE void values(const Tally *s, long ticks, long n, REAL *out) {
+    V all_ticks = all(ticks), settled = pick(s->outside == s->end, all(INFINITY), largest(s->outside, all(0)));
     V value[SCORES] = {
-        delay,
-        mean(start_total, start_ticks),
-        mean(false_total, false_ticks),
-        mean(miss_total, ill_ticks),
-        root(mean(sum_q, all_ticks)),
-        root(mean(sum_w, all_ticks)),
-        root(mean(ill_q, ill_ticks)),
-        root(mean(ill_w, ill_ticks)),
-        pick(peak_q < 0, all(NAN), root(peak_q)),
-        pick(peak_w < 0, all(NAN), root(peak_w)),
-        pick(end < 0, all(NAN), settled),
-        root(mean(sum_u, all_ticks)),
-        root(mean(ill_u, ill_ticks)),
-        pick(peak_u < 0, all(NAN), root(peak_u)),
-        count(ok),
+        s->delay,
+        mean(s->start_alarms, s->start_ticks),
+        mean(s->false_alarms, s->false_ticks),
+        mean(s->missed, s->ill_ticks),
+        root(mean(s->sum_q, all_ticks)),
+        root(mean(s->sum_w, all_ticks)),
+        root(mean(s->ill_q, s->ill_ticks)),
+        root(mean(s->ill_w, s->ill_ticks)),
+        pick(s->peak_q < 0, all(NAN), root(s->peak_q)),
+        pick(s->peak_w < 0, all(NAN), root(s->peak_w)),
+        pick(s->end < 0, all(NAN), settled),
+        root(mean(s->sum_u, all_ticks)),
+        root(mean(s->ill_u, s->ill_ticks)),
+        pick(s->peak_u < 0, all(NAN), root(s->peak_u)),
+        count(s->ok),
     };
     for (int i = 0; i < SCORES; i++) memcpy(out + i * n, &value[i], sizeof(V));
 }
 
+/* normals: NULL, or those of these lanes, (ticks, 6, n); drawn: draw them */
+INLINE void run(int side, const Params *params, const REAL *scenario, const REAL *normals, int drawn, uint64_t seed,
+                long n, long ticks, int substeps, REAL dt, REAL *out) {
+    Loop l[2];
+    for (int j = 0; j < side; j++) begin(&l[j], params, scenario + j * LANES, seed + j, n, substeps, dt);
+    for (long k = 0; k < ticks; k++) {
+        for (int j = 0; j < side; j++) tick(&l[j], params, normals ? normals + j * LANES : 0, drawn, k, dt, n);
+        for (int i = 0; i < substeps; i++) rk4(l, side);
+    }
+    for (int j = 0; j < side; j++) values(&l[j].s, ticks, n, out + j * LANES);
+}
+
+#define RUN(side, normals, drawn) \
+    run(side, params, scenario + i, normals, drawn, seed * 0x2545f4914f6cdd1du + i, n, ticks, substeps, dt, out + i)
+
 /* n scenarios, a multiple of lanes(); params (24), scenario (78, n): leaves of the system's trees in their order;
    noise: 0 none, 1 drawn here, 2 given in normals (ticks, 6, n); out (15, n): Scores */
-void observer_pd(const REAL *params, const REAL *scenario, const REAL *normals, int noise, uint64_t seed, long n,
+void observer_pd(const REAL *numbers, const REAL *scenario, const REAL *normals, int noise, uint64_t seed, long n,
                  long ticks, int substeps, double dt, REAL *out) {
+    const Params *params = (const Params *)numbers;
 #ifdef __SSE__
     unsigned int csr = _mm_getcsr();
     _mm_setcsr(csr | 0x8040); /* numbers too small to be normal are zero, as XLA has it */
 #endif
-    for (long i = 0; i < n; i += LANES) {
-        uint64_t own = seed * 0x2545f4914f6cdd1du + (uint64_t)i * 0xd1342543de82ef95u;
-        const Params *p = (const Params *)params;
-        if (noise == 0) run(p, scenario + i, 0, 0, own, n, ticks, substeps, dt, out + i);
-        if (noise == 1) run(p, scenario + i, 0, 1, own, n, ticks, substeps, dt, out + i);
-        if (noise == 2) run(p, scenario + i, normals + i, 0, own, n, ticks, substeps, dt, out + i);
+    for (long i = 0; i < n; i += 2 * LANES) {
+        if (n - i == LANES) {
+            if (noise == 0) RUN(1, 0, 0);
+            if (noise == 1) RUN(1, 0, 1);
+            if (noise == 2) RUN(1, normals + i, 0);
+        } else {
+            if (noise == 0) RUN(2, 0, 0);
+            if (noise == 1) RUN(2, 0, 1);
+            if (noise == 2) RUN(2, normals + i, 0);
+        }
     }
 #ifdef __SSE__
     _mm_setcsr(csr);
