@@ -17,18 +17,23 @@ from jaxatt.vec import Mat3, Quat, Vec3, cross, norm, safe_sqrt
 
 def mrp_rate(q: Vec3, w: Vec3) -> Vec3:
     """dq/dt = G(q) w [1/s] of MRP q for the body rate w [rad/s]; G = ((1 - q.q) I + 2 S(q) + 2 q q') / 4."""
-    return 0.25 * ((1 - q @ q) * w + 2 * cross(q, w) + 2 * (q @ w) * q)
+    return (0.25 - 0.25 * (q @ q)) * w + 0.5 * (cross(q, w) + (q @ w) * q)
 
 
 def mrp_rate_transposed(q: Vec3, v: Vec3) -> Vec3:
     """G(q)' v, the transpose of the map of `mrp_rate`."""
-    return 0.25 * ((1 - q @ q) * v - 2 * cross(q, v) + 2 * (q @ v) * q)
+    return (0.25 - 0.25 * (q @ q)) * v + 0.5 * ((q @ v) * q - cross(q, v))
 
 
 def mrp_product(p: Vec3, q: Vec3) -> Vec3:
-    """MRP of the matrix product A(p) A(q), the representative with |.| <= 1; no singularity."""
-    numerator = (1 - q @ q) * p + (1 - p @ p) * q + 2 * cross(p, q)
-    return _inner_ratio(numerator, 1 + (p @ p) * (q @ q) - 2 * (p @ q))
+    """MRP of the matrix product A(p) A(q), the representative with |.| <= 1; no singularity.
+
+    By way of quaternions: the ratio of MRP algebra is 0/0 for opposite representatives of one attitude.
+    """
+    pp, qq = p @ p, q @ q
+    scalar = (1 - pp) * (1 - qq) - 4 * (p @ q)
+    vector = (1 - qq) * p + (1 - pp) * q + 2 * cross(p, q)
+    return jnp.where(scalar < 0, -2, 2) / ((1 + pp) * (1 + qq) + jnp.abs(scalar)) * vector
 
 
 def mrp_error(q: Vec3, q_d: Vec3) -> Vec3:
@@ -36,16 +41,9 @@ def mrp_error(q: Vec3, q_d: Vec3) -> Vec3:
     return mrp_product(-q_d, q)
 
 
-def _inner_ratio(n: Vec3, d) -> Vec3:
-    # n/d or its shadow -n d/|n|^2, whichever is shorter. |n|^2 + d^2 > 0 always, so neither divides by zero.
-    nn, dd = n @ n, d * d
-    inner = nn <= dd
-    return jnp.where(inner, 1 / jnp.where(inner, d, 1), -d / jnp.where(inner, 1, nn)) * n
-
-
 def mrp_inner(q: Vec3) -> Vec3:
     """The representative with |q| <= 1: the shadow -q/|q|^2 where |q| > 1."""
-    return _inner_ratio(q, jnp.ones_like(q.x))
+    return -1 / jnp.where(q @ q > 1, q @ q, -1) * q
 
 
 def mrp_nearest(q: Vec3, p: Vec3) -> Vec3:
