@@ -62,17 +62,16 @@ INLINE Sym inverse(const Sym *m) {
 
 INLINE Sym scaled(V s, Sym m) { return (Sym){s * m.xx, s * m.xy, s * m.xz, s * m.yy, s * m.yz, s * m.zz}; }
 
-/* exp(a) for a <= 0 */
-INLINE V decay(V a) {
-    static const double c[] = {1, 1, 1. / 2, 1. / 6, 1. / 24, 1. / 120, 1. / 720, 1. / 5040, 1. / 40320, 1. / 362880,
-                               1. / 3628800, 1. / 39916800, 1. / 479001600};
+/* 2^a for a <= 0; Taylor's series of the rest, in [-1/2, 1/2] */
+INLINE V exp2_of(V a) {
+    static const double c[] = {
+        1.0, 6.9314718055994529e-1, 2.4022650695910069e-1, 5.5504108664821576e-2, 9.6181291076284769e-3,
+        1.3333558146428443e-3, 1.5403530393381608e-4, 1.5252733804059840e-5, 1.3215486790144307e-6,
+        1.0178086009239699e-7, 7.0549116208011228e-9, 4.4455382718708111e-10, 2.5678435993488201e-11};
     const int degree = IS_FLOAT ? 6 : 12;
-    a = largest(a, all(IS_FLOAT ? -87 : -708));
-    M k = __builtin_convertvector(a * (REAL)1.4426950408889634 - (REAL)0.5, M); /* rounds, for a <= 0 */
-    V n = __builtin_convertvector(k, V);
-    V r = (a - n * (REAL)(IS_FLOAT ? 0.693359375 : 0.693147180369123816490))
-          - n * (REAL)(IS_FLOAT ? -2.12194440054690583e-4 : 1.90821492927058770002e-10);
-    V p = all(c[degree]);
+    a = largest(a, all(IS_FLOAT ? -126 : -1022));
+    M k = __builtin_convertvector(a - (REAL)0.5, M); /* rounds, for a <= 0 */
+    V r = a - __builtin_convertvector(k, V), p = all(c[degree]);
     for (int i = degree - 1; i >= 0; i--) p = p * r + (REAL)c[i];
     return (V)((M)p + (k << (IS_FLOAT ? 23 : 52)));
 }
@@ -150,7 +149,7 @@ typedef struct { /* params, in the order of the leaves of observer_pd.Params, th
     REAL alpha, beta, sigma, k_q, k_w0, eps, J[9], q_d[3], w_d[3], u_max, sign, lambda_max;
 } Params;
 
-typedef struct { V onset, end, bias, drift, rate, spread, std, scale; M stuck; } Fault; /* one channel */
+typedef struct { V onset, end, bias, drift, settled, rate, spread, std, scale; M stuck; } Fault; /* one channel */
 
 typedef struct { /* what stays during a run of one vector of lanes */
     Sym J4, J_inv4, Jh4, Jh_inv4; /* 4 J with the sign of w x J w, its inverse without; of the observer */
@@ -167,7 +166,9 @@ typedef struct { /* what a sweep keeps: sums, counts, extremes */
     M ok;
 } Tally;
 
-typedef struct { Plant c; Hold z; X x; Fault fault[CHANNELS]; V onset, y[CHANNELS]; Generator g; Tally s; } Loop;
+typedef struct { Vec q, w, u4; } Seen; /* readings, and four times the torque that they give */
+
+typedef struct { Plant c; Hold z; X x; Seen seen; Fault fault[CHANNELS]; V onset, y[CHANNELS]; Generator g; Tally s; } Loop;
 
 typedef struct { Vec n; V ratio; } Error; /* e_q = ratio n */
 
@@ -191,13 +192,17 @@ INLINE Vec torque4(const Plant *c, const Hold *z, Error e, Vec w) {
                  clipped(z->wanted.z - k * e.n.z - z->k4_w * w.z, c->u4_max)};
 }
 
-/* dx/dt, of the attitudes four times that */
-INLINE X flow(const Plant *c, const Hold *z, X x) {
+INLINE Seen see(const Plant *c, const Hold *z, X x) {
     Vec yq = {z->gain[0] * x.q.x + z->offset[0], z->gain[1] * x.q.y + z->offset[1], z->gain[2] * x.q.z + z->offset[2]};
     Vec yw = {z->gain[3] * x.w.x + z->offset[3], z->gain[4] * x.w.y + z->offset[4], z->gain[5] * x.w.z + z->offset[5]};
+    return (Seen){yq, yw, torque4(c, z, error(c, dot(yq, yq), yq), yw)};
+}
+
+/* dx/dt, of the attitudes four times that */
+INLINE X flow(const Plant *c, X x, Seen y) {
+    Vec yq = y.q, yw = y.w, u4 = y.u4;
     Vec xi_q = minus(yq, x.qh), xi_w = minus(yw, x.wh), y2 = twice(yq), q2 = twice(x.q);
-    V yy = dot(yq, yq), a = 1 - yy;
-    Vec u4 = torque4(c, z, error(c, yy, yq), yw);
+    V a = 1 - dot(yq, yq);
     Vec m = {c->beta4 * xi_w.x + u4.x, c->beta4 * xi_w.y + u4.y, c->beta4 * xi_w.z + u4.z};
     m = cross_plus(x.wh, apply(&c->Jh4, yw), m);
     m = cross_plus(xi_q, y2, sum_plus(a, xi_q, dot(y2, xi_q), yq, m));
@@ -206,6 +211,8 @@ INLINE X flow(const Plant *c, const Hold *z, X x) {
     Vec dq = cross_plus(q2, x.w, (Vec){a_q * x.w.x + b_q * q2.x, a_q * x.w.y + b_q * q2.y, a_q * x.w.z + b_q * q2.z});
     return (X){dq, apply(&c->J_inv4, cross_plus(x.w, apply(&c->J4, x.w), u4)), dqh, apply(&c->Jh_inv4, m)};
 }
+
+INLINE X flow_at(const Plant *c, const Hold *z, X x) { return flow(c, x, see(c, z, x)); }
 
 INLINE X ahead(X x, REAL h, X k) {
     V h1 = all(h), h4 = all(h / 4);
@@ -219,12 +226,12 @@ INLINE X added(X a, X b) {
 /* one step of several vectors side by side: the processor fills the waits of one with the work of the other */
 INLINE void rk4(Loop *l, int side) {
     X k1[2], k2[2], k3[2];
-    for (int j = 0; j < side; j++) k1[j] = flow(&l[j].c, &l[j].z, l[j].x);
-    for (int j = 0; j < side; j++) k2[j] = flow(&l[j].c, &l[j].z, ahead(l[j].x, l[j].c.h / 2, k1[j]));
-    for (int j = 0; j < side; j++) k3[j] = flow(&l[j].c, &l[j].z, ahead(l[j].x, l[j].c.h / 2, k2[j]));
+    for (int j = 0; j < side; j++) k1[j] = flow(&l[j].c, l[j].x, l[j].seen);
+    for (int j = 0; j < side; j++) k2[j] = flow_at(&l[j].c, &l[j].z, ahead(l[j].x, l[j].c.h / 2, k1[j]));
+    for (int j = 0; j < side; j++) k3[j] = flow_at(&l[j].c, &l[j].z, ahead(l[j].x, l[j].c.h / 2, k2[j]));
     for (int j = 0; j < side; j++) {
         REAL h = l[j].c.h;
-        X ends = added(k1[j], flow(&l[j].c, &l[j].z, ahead(l[j].x, h, k3[j])));
+        X ends = added(k1[j], flow_at(&l[j].c, &l[j].z, ahead(l[j].x, h, k3[j])));
         l[j].x = ahead(ahead(l[j].x, h / 3, added(k2[j], k3[j])), h / 6, ends);
     }
 }
@@ -262,11 +269,12 @@ INLINE void begin(Loop *l, const Params *params, const REAL *scenario, uint64_t 
     l->onset = all(INFINITY);
     for (int i = 0; i < CHANNELS; i++) {
         Fault *f = &l->fault[i];
-        f->onset = NEXT, f->end = NEXT, f->bias = NEXT, f->drift = NEXT, f->rate = -1 / NEXT;
+        f->onset = NEXT, f->end = NEXT, f->bias = NEXT, f->drift = NEXT, f->rate = (REAL)-1.4426950408889634 / NEXT;
         V random = NEXT;
         f->scale = NEXT, f->std = i < AXES ? std_q : std_w;
         V grown = NEXT * f->std;
         f->spread = root(grown * grown + random * random), f->stuck = NEXT > 0;
+        f->scale = kept(~f->stuck, f->scale), f->settled = f->bias + f->drift;
         l->onset = smallest(l->onset, f->onset);
         l->y[i] = x[i];
     }
@@ -301,10 +309,10 @@ INLINE void tick(Loop *l, const Params *params, const REAL *normals, int drawn, 
     M ill = {0};
     for (int i = 0; i < CHANNELS; i++) {
         const Fault *f = &l->fault[i];
-        M on = (t >= f->onset) & (t < f->end), stuck = on & f->stuck;
-        V drift = f->drift - f->drift * decay(kept(on, t - f->onset) * f->rate);
-        z->gain[i] = kept(~stuck, pick(on, f->scale, all(1)));
-        z->offset[i] = pick(stuck, y[i], pick(on, f->bias + drift + f->spread * noise[i], f->std * noise[i]));
+        M on = (t >= f->onset) & (t < f->end);
+        V faulty = f->settled - f->drift * exp2_of(largest(t - f->onset, all(0)) * f->rate) + f->spread * noise[i];
+        z->gain[i] = pick(on, f->scale, all(1));
+        z->offset[i] = pick(on, pick(f->stuck, y[i], faulty), f->std * noise[i]);
         y[i] = z->gain[i] * truth[i] + z->offset[i];
         ill |= on;
     }
@@ -328,6 +336,7 @@ INLINE void tick(Loop *l, const Params *params, const REAL *normals, int drawn, 
     z->k4_w = 4 * z->k_w;
     z->wanted = times(z->k4_w, c->w_d);
     Vec u4 = torque4(c, z, ey, yw);
+    l->seen = (Seen){yq, yw, u4};
 
     /* score */
     Error e_q = error(c, dot(x.q, x.q), x.q);
@@ -379,7 +388,10 @@ INLINE void run(int side, const Params *params, const REAL *scenario, const REAL
     for (int j = 0; j < side; j++) begin(&l[j], params, scenario + j * LANES, seed + j, n, substeps, dt);
     for (long k = 0; k < ticks; k++) {
         for (int j = 0; j < side; j++) tick(&l[j], params, normals ? normals + j * LANES : 0, drawn, k, dt, n);
-        for (int i = 0; i < substeps; i++) rk4(l, side);
+        for (int i = 0; i < substeps; i++) {
+            rk4(l, side);
+            for (int j = 0; j < (i + 1 < substeps ? side : 0); j++) l[j].seen = see(&l[j].c, &l[j].z, l[j].x);
+        }
     }
     for (int j = 0; j < side; j++) values(&l[j].s, ticks, n, out + j * LANES);
 }

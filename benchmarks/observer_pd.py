@@ -285,15 +285,21 @@ def rows(quick: bool):
                         first, second = seconds(mine), seconds(mine)
                         if n == 1 or quick:  # later sizes run the same program
                             yield _row("forward compile", first - second, "s")
-                    limit, _, _ = _c_call(library, p, s, TICKS, loop.dt, loop.substeps, "drawn" if noise == "noise" else "none")
+                    limit, _, _ = _c_call(
+                        library, p, s, TICKS, loop.dt, loop.substeps, "drawn" if noise == "noise" else "none"
+                    )
                     c = cpu_ns(limit, steps, max(repeats, 3 * 1024 // n))
                     ours = cpu_ns(mine, steps, repeats)
                     yield _row(f"{name}, N = {n}, C", c, "ns")
                     yield _row(f"{name}, N = {n}, jaxatt", ours, "ns")
                     yield _row(f"{name}, N = {n}, share of C", 100 * c / ours, "%")
                     if n == 1024 and noise == "noise" and (form == "shipped" or not quick):
-                        yield _row(f"{name}, N = {n}, naive JAX / jaxatt", cpu_ns(naive(loop, s, TICKS), steps, 2) / ours, "x")
-                        yield _row(f"{name}, N = {n}, NumPy / jaxatt", cpu_ns(numpy(loop, s, TICKS), steps, 1) / ours, "x")
+                        yield _row(
+                            f"{name}, N = {n}, naive JAX / jaxatt", cpu_ns(naive(loop, s, TICKS), steps, 2) / ours, "x"
+                        )
+                        yield _row(
+                            f"{name}, N = {n}, NumPy / jaxatt", cpu_ns(numpy(loop, s, TICKS), steps, 1) / ours, "x"
+                        )
     yield from _gradient()
     if not quick:
         yield from _devices()

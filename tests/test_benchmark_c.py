@@ -29,8 +29,10 @@ def libraries():
 
 
 def agree(a, b, tolerance):
+    """Scores agree; in float32 an alarm at the threshold may fall to either side in one tick of a window."""
     for name, x, y in zip(a._fields, a, b):
-        np.testing.assert_allclose(np.asarray(x, float), np.asarray(y, float), tolerance, err_msg=name)
+        tick = 0.02 if tolerance > 1e-6 and name in ("miss", "false_alarms", "start_up_alarms") else 0
+        np.testing.assert_allclose(np.asarray(x, float), np.asarray(y, float), tolerance, tick, err_msg=name)
 
 
 @pytest.mark.parametrize("form", bench.FORMS)
@@ -65,7 +67,7 @@ def test_c_draws_standard_normal_noise(libraries):
         assert abs(a - c) < 0.05 * c and abs(b - c) < 0.05 * c, name
 
 
-def test_plain_loops_give_the_scores_of_a_sweep(monkeypatch):
+def test_plain_loops_give_the_scores_of_a_sweep():
     loop, s = bench.FORMS["shipped"], bench.scenarios(16, np.float64)
     ours = sweep(bench.quiet(loop), params, s, jax.random.key(0), ticks=TICKS, score=score)
     agree(ours, bench.numpy(loop, s, TICKS, noisy=False)(), 1e-9)
