@@ -56,7 +56,7 @@ def test_c_gives_the_scores_of_a_sweep_with_its_noise(libraries):
 def test_c_draws_standard_normal_noise(libraries):
     s = bench.scenarios(256, np.float64)
     loop = bench.FORMS["shipped"]
-    run = lambda seed: bench.c_scores(  # noqa: E731
+    run = lambda seed: bench.c_scores(
         libraries[np.float64], params, s, ticks=TICKS, dt=loop.dt, substeps=loop.substeps, noise="drawn", seed=seed
     )
     one, other = run(1), run(2)
