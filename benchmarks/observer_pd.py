@@ -54,8 +54,9 @@ def scenarios(n: int, dtype, seed: int = 0) -> Scenario:
 
     three = lambda: Vec3(fault(), fault(), fault())
     s = scenario._replace(q=near(scenario.q), w=near(scenario.w), star=three(), gyro=three())
-    s = s._replace(q_hat=s.q, w_hat=s.w, J=jax.tree.map(lambda a: np.asarray(a), s.J))
-    s = s._replace(J=jax.tree.map(lambda a, f=uniform(0.9, 1.1): a * f, s.J))
+    s = s._replace(q_hat=s.q, w_hat=s.w)
+    heavier = uniform(0.9, 1.1)
+    s = s._replace(J=jax.tree.map(lambda a: a * heavier, s.J))
     return jax.tree.map(lambda a: np.broadcast_to(np.asarray(a, dtype), (n,)).copy(), s)
 
 
@@ -273,7 +274,7 @@ def rows(quick: bool):
     key = jax.random.key(0)
     for real, dtype in (("float32", np.float32), ("float64", np.float64)):
         library = c_library(source, {"float32": "float", "float64": "double"}[real])
-        p = jax.tree.map(lambda a: np.asarray(a, dtype), params)
+        p = jax.tree.map(dtype, params)
         for form, loop in FORMS.items():
             for noise, system_ in (("noise", loop), ("no noise", quiet(loop))):
                 name = f"{real}, {form}, {noise}"
