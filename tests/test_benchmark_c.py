@@ -1,0 +1,74 @@
+"""The benchmark's C program, and its plain loops, compute what the system computes."""
+
+import shutil
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from benchmarks import observer_pd as bench
+from benchmarks.measure import c_library
+from jaxatt import noise_of, sweep
+from jaxatt.systems.observer_pd import params, score
+from jaxatt.vec import Vec3
+
+jax.config.update("jax_enable_x64", True)
+
+TICKS = 300
+P = params._replace(q_d=Vec3(0.1, -0.2, 0.3), w_d=Vec3(0.0, 0.0, 0.01), u_max=60.0)
+
+
+@pytest.fixture(scope="module")
+def libraries():
+    if shutil.which("gcc") is None:
+        pytest.skip("no gcc")
+    source = Path(bench.__file__).with_suffix(".c")
+    return {np.float64: c_library(source, "double"), np.float32: c_library(source, "float")}
+
+
+def agree(a, b, tolerance):
+    """Scores agree; in float32 an alarm at the threshold may fall to either side in one tick of a window."""
+    for name, x, y in zip(a._fields, a, b):
+        tick = 0.02 if tolerance > 1e-6 and name in ("miss", "false_alarms", "start_up_alarms") else 0
+        np.testing.assert_allclose(np.asarray(x, float), np.asarray(y, float), tolerance, tick, err_msg=name)
+
+
+@pytest.mark.parametrize("form", bench.FORMS)
+@pytest.mark.parametrize(("dtype", "tolerance"), [(np.float64, 1e-9), (np.float32, 1e-5)])
+def test_c_gives_the_scores_of_a_sweep_without_noise(libraries, form, dtype, tolerance):
+    loop, s = bench.FORMS[form], bench.scenarios(40, dtype)
+    p = jax.tree.map(lambda a: np.asarray(a, dtype), P)
+    ours = sweep(bench.quiet(loop), p, s, jax.random.key(0), ticks=TICKS, score=score)
+    c = bench.c_scores(libraries[dtype], p, s, ticks=TICKS, dt=loop.dt, substeps=loop.substeps)
+    agree(ours, c, tolerance)
+
+
+def test_c_gives_the_scores_of_a_sweep_with_its_noise(libraries):
+    loop, s, key = bench.FORMS["shipped"], bench.scenarios(8, np.float64), jax.random.key(0)
+    noise = np.stack([noise_of(loop, key, i, TICKS) for i in range(8)], axis=-1)
+    ours = sweep(loop, P, s, key, ticks=TICKS, score=score)
+    c = bench.c_scores(libraries[np.float64], P, s, ticks=TICKS, dt=loop.dt, substeps=loop.substeps, noise=noise)
+    agree(ours, c, 1e-9)
+
+
+def test_c_draws_standard_normal_noise(libraries):
+    s = bench.scenarios(256, np.float64)
+    loop = bench.FORMS["shipped"]
+    run = lambda seed: bench.c_scores(
+        libraries[np.float64], params, s, ticks=TICKS, dt=loop.dt, substeps=loop.substeps, noise="drawn", seed=seed
+    )
+    one, other = run(1), run(2)
+    ours = sweep(loop, params, s, jax.random.key(0), ticks=TICKS, score=score)
+    assert np.all(one.ok == 1) and np.any(one.rms_w != other.rms_w)
+    for name in ("rms_q_ill", "rms_w_ill", "rms_u_ill", "miss"):
+        a, b, c = (np.nanmean(getattr(x, name)) for x in (one, other, ours))
+        assert abs(a - c) < 0.05 * c and abs(b - c) < 0.05 * c, name
+
+
+def test_plain_loops_give_the_scores_of_a_sweep():
+    loop, s = bench.FORMS["shipped"], bench.scenarios(16, np.float64)
+    ours = sweep(bench.quiet(loop), params, s, jax.random.key(0), ticks=TICKS, score=score)
+    agree(ours, bench.numpy(loop, s, TICKS, noisy=False)(), 1e-9)
+    agree(ours, jax.tree.map(jnp.asarray, bench.naive(loop, s, TICKS, noisy=False)()), 1e-9)
