@@ -11,8 +11,26 @@ from jaxatt.study import rerun, sweep, tune
 from jaxatt.vec import Mat3, Quat, Vec3
 
 __all__ = [
-    "Fault", "Mat3", "Now", "Quat", "Reading", "System", "Vec3", "dead", "every", "fast_cpu", "mrp_error",
-    "mrp_rate", "noise_of", "on_axes", "rerun", "rk4", "simulate", "sweep", "tune", "vmapped",
+    "Fault",
+    "Mat3",
+    "Now",
+    "Quat",
+    "Reading",
+    "System",
+    "Vec3",
+    "dead",
+    "every",
+    "fast_cpu",
+    "mrp_error",
+    "mrp_rate",
+    "noise_of",
+    "on_axes",
+    "rerun",
+    "rk4",
+    "simulate",
+    "sweep",
+    "tune",
+    "vmapped",
 ]
 
 __version__ = "0.1.0"

@@ -28,12 +28,13 @@ def mrp_rate_transposed(q: Vec3, v: Vec3) -> Vec3:
 def mrp_product(p: Vec3, q: Vec3) -> Vec3:
     """MRP of the matrix product A(p) A(q), the representative with |.| <= 1; no singularity.
 
-    By way of quaternions: the ratio of MRP algebra is 0/0 for opposite representatives of one attitude.
+    numerator / d is one representative, numerator / (d - c) its shadow; d >= c / 2 says that the first is the inner
+    one. c >= 1, so neither divides by zero, whereas the textbook ratio is 0/0 for opposite representatives.
     """
     pp, qq = p @ p, q @ q
-    scalar = (1 - pp) * (1 - qq) - 4 * (p @ q)
-    vector = (1 - qq) * p + (1 - pp) * q + 2 * cross(p, q)
-    return jnp.where(scalar < 0, -2, 2) / ((1 + pp) * (1 + qq) + jnp.abs(scalar)) * vector
+    numerator = (1 - qq) * p + (1 - pp) * q + 2 * cross(p, q)
+    c, d = (1 + pp) * (1 + qq), 1 + pp * qq - 2 * (p @ q)
+    return 1 / jnp.where(c <= 2 * d, d, d - c) * numerator
 
 
 def mrp_error(q: Vec3, q_d: Vec3) -> Vec3:
@@ -49,10 +50,8 @@ def mrp_inner(q: Vec3) -> Vec3:
 def mrp_nearest(q: Vec3, p: Vec3) -> Vec3:
     """The representative of q, itself or its shadow, that lies nearest to p."""
     qq = q @ q
-    zero = qq == 0  # the shadow of zero lies at infinity
-    shadow = -q / jnp.where(zero, 1, qq)
-    keep = zero | ((q - p) @ (q - p) <= (shadow - p) @ (shadow - p))
-    return Vec3(*(jnp.where(keep, a, b) for a, b in zip(q, shadow)))
+    keep = qq - 1 <= 2 * (q @ p)  # |q - p| <= |-q/|q|^2 - p|, which zero passes: its shadow lies at infinity
+    return 1 / jnp.where(keep, 1, -qq) * q
 
 
 def mrp_matrix(q: Vec3) -> Mat3:

@@ -12,6 +12,7 @@ from typing import Any, NoReturn
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 
 def refuse(name: str, must: str, value, lane: int | None = None) -> NoReturn:
@@ -22,7 +23,7 @@ def refuse(name: str, must: str, value, lane: int | None = None) -> NoReturn:
 
 def concrete(tree) -> bool:
     """Whether a tree holds numbers and no tracers."""
-    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
+    return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
 def each(name: str, must: str, value, good) -> None:
@@ -118,9 +119,7 @@ def whole(name: str, value, least: int = 1) -> int:
 
 def _dtype(trees):
     """The floating type of a run: what the floating leaves promote to."""
-    floating = [
-        leaf for leaf in jax.tree.leaves(trees) if jnp.issubdtype(jnp.result_type(leaf), jnp.floating)
-    ]
+    floating = [leaf for leaf in jax.tree.leaves(trees) if jnp.issubdtype(jnp.result_type(leaf), jnp.floating)]
     return jnp.result_type(*floating, 1.0)
 
 

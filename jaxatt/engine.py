@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from functools import lru_cache, partial
+from functools import cache, partial
 from math import prod
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax._src import xla_bridge  # the one place that knows whether a computation has run
+from jax.dtypes import prng_key
 from jax.extend.random import threefry_2x32
 
 from jaxatt import check, scores
@@ -78,7 +80,9 @@ def _like(tree, example, what: str):
 
     def fit(a, b):
         if not jnp.can_cast(jnp.result_type(a), b.dtype, "same_kind"):
-            raise TypeError(f"`{what}` must return {b.dtype} where the state is {b.dtype}, but it is {jnp.result_type(a)}.")
+            raise TypeError(
+                f"`{what}` must return {b.dtype} where the state is {b.dtype}, but it is {jnp.result_type(a)}."
+            )
         if jnp.broadcast_shapes(jnp.shape(a), b.shape) != b.shape:
             raise TypeError(f"`{what}` must return shape {b.shape} where the state has it, but it is {jnp.shape(a)}.")
         return jnp.broadcast_to(jnp.asarray(a, b.dtype), b.shape)
@@ -200,7 +204,7 @@ def raw_key(key):
 
     Raises TypeError for anything else.
     """
-    if hasattr(key, "dtype") and jax.dtypes.issubdtype(key.dtype, jax.dtypes.prng_key):
+    if hasattr(key, "dtype") and jnp.issubdtype(key.dtype, prng_key):
         key = jax.random.key_data(key)
     if not hasattr(key, "dtype") or key.dtype != jnp.uint32 or key.shape[-1:] != (2,):
         raise TypeError(f"`key` must be a key of jax.random.key(seed), but it is {key!r}.")
@@ -258,7 +262,7 @@ def _simulate(system, ticks, every, keyed, params, scenario, source):
     lanes = source.shape[:-1] if keyed else source.shape[2:]
     if keyed:
 
-        def noise(c):
+        def noise(c):  # pyright: ignore[reportRedeclaration]
             draw = partial(_chunk_noise, system, k0=c * chunk, ticks=chunk, lanes=(), dtype=dtype)
             draw_lanes = lambda key: draw(key)
             for _ in lanes:
@@ -272,9 +276,7 @@ def _simulate(system, ticks, every, keyed, params, scenario, source):
         def noise(c):
             return chunks[c]
 
-    _, logs = _run(
-        system, params, scenario, len(lanes), ticks, chunk, noise, lambda none, now, log: (none, log), None
-    )
+    _, logs = _run(system, params, scenario, len(lanes), ticks, chunk, noise, lambda none, now, log: (none, log), None)
     if every == 1:
         return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:ticks], logs)
     return jax.tree.map(lambda a: a[:, 0], logs)
@@ -353,7 +355,7 @@ def vmapped(system: System) -> System:
         return x, _Lanes(z, jnp.zeros(()))
 
     def tick(params, scenario, now, x, z, noise):
-        one = lambda scenario, x, z, noise: system.tick(params, scenario, now, x, z, noise)  # noqa: E731
+        one = lambda scenario, x, z, noise: system.tick(params, scenario, now, x, z, noise)
         x, inner, log = over(one, z.lanes, scenario, x, z.z, noise)
         return x, _Lanes(inner, z.lanes), log
 
@@ -379,7 +381,7 @@ def compiled(f: Callable, static: int, *operands) -> Callable:
     return _jitted(f, static, traced(*operands) or jax.default_backend() != "cpu")
 
 
-@lru_cache(maxsize=None)
+@cache
 def _jitted(f: Callable, static: int, plain: bool):
     options = None if plain else {"xla_cpu_prefer_vector_width": 512}
     return jax.jit(f, static_argnums=tuple(range(static)), compiler_options=options)
@@ -399,7 +401,7 @@ def fast_cpu() -> None:
     already set there stay. Elsewhere than on CPU it does no harm. Raises RuntimeError if a computation has
     run already.
     """
-    if jax._src.xla_bridge.backends_are_initialized():
+    if xla_bridge.backends_are_initialized():
         raise RuntimeError("`fast_cpu` must be called before the first computation of JAX, but one has run.")
     present = os.environ.get("XLA_FLAGS", "")
     wanted = [f"{name}={value}" for name, value in _FLAGS.items() if name not in present]

@@ -108,28 +108,28 @@ def _where(inside, value, otherwise):
     return value if inside is True else jnp.where(inside, value, otherwise)
 
 
-def mean(value, inside=True) -> Mean:
+def mean(value, inside: Any = True) -> Mean:
     """Tally the mean of value (a bool gives a share) over the ticks where ``inside`` holds."""
     value = jnp.asarray(value, jnp.result_type(value, 1.0))
     return Mean(_where(inside, value, 0), jnp.broadcast_to(jnp.asarray(inside, value.dtype), value.shape))
 
 
-def rms(square, inside=True) -> Rms:
+def rms(square, inside: Any = True) -> Rms:
     """Tally a root mean square; takes the squared value, for instance ``log.q @ log.q``."""
     return Rms(*mean(square, inside))
 
 
-def peak(value, inside=True) -> Peak:
+def peak(value, inside: Any = True) -> Peak:
     """Tally the largest value over the ticks where ``inside`` holds."""
     return Peak(_where(inside, value, -jnp.inf))
 
 
-def first(now, condition, since=0.0) -> First:
+def first(now, condition, since: Any = 0.0) -> First:
     """Tally the first time [s], counted from ``since``, at which the condition holds."""
     return First(jnp.where(condition, now.t - since, jnp.inf))
 
 
-def settling(now, outside, inside=True) -> Settling:
+def settling(now, outside, inside: Any = True) -> Settling:
     """Tally the settling time [s]: the last time at which ``outside`` holds, in the window ``inside``."""
     end = _where(inside, jnp.broadcast_to(now.t, jnp.shape(outside)), -jnp.inf)
     return Settling(jnp.where(outside, end, -jnp.inf), end)

@@ -46,9 +46,10 @@ def sweep(system: System, params, scenarios, key, *, ticks: int, score: Callable
     with _bar(progress, n, " scenarios") as bar:
         for block in range(blocks + 2 * len(devices)):
             if block < blocks:
-                device = block % len(devices)
-                here = jax.device_put((_lanes_of(rows, block), np.int32(block)), devices[device])
-                under_way.append(run(system, score, ticks, layout, *at[device], *here))
+                params, key = at[block % len(devices)]  # they decide where it runs
+                under_way.append(
+                    run(system, score, ticks, layout, params, key, _lanes_of(rows, block), np.int32(block))
+                )
             if under_way and block >= 2 * len(devices) - 1:
                 done.append(jax.tree.map(np.asarray, under_way.popleft()))
                 bar.update(min(BLOCK, n - (len(done) - 1) * BLOCK))

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 
 
 class Vec3(NamedTuple):
@@ -34,7 +35,8 @@ class Vec3(NamedTuple):
     def __mul__(self, s):
         return Vec3(self.x * s, self.y * s, self.z * s)
 
-    __rmul__ = __mul__
+    def __rmul__(self, s):
+        return self * s
 
     def __truediv__(self, s):
         return self * (1 / s)
@@ -64,9 +66,10 @@ class Mat3(NamedTuple):
     def __mul__(self, s):
         return Mat3(self.x * s, self.y * s, self.z * s)
 
-    __rmul__ = __mul__
+    def __rmul__(self, s):
+        return self * s
 
-    def __matmul__(self, other):
+    def __matmul__(self, other) -> Any:
         if isinstance(other, Mat3):
             columns = other.T
             return Mat3(*(Vec3(row @ columns.x, row @ columns.y, row @ columns.z) for row in self))
@@ -178,7 +181,7 @@ def once(f, *operands):
     XLA's CPU compiler repeats shared subexpressions in every consumer, each output of a fusion on its own, unless
     a control-flow boundary holds them. This one is always taken, but the compiler does not know.
     """
-    traced = [leaf for leaf in jax.tree.leaves(operands) if isinstance(leaf, jax.core.Tracer)]
+    traced = [leaf for leaf in jax.tree.leaves(operands) if isinstance(leaf, Tracer)]
     if not traced:
         return f(*operands)
     shapes = jax.eval_shape(f, *operands)

@@ -7,9 +7,27 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxatt.attitude import (
-    euler_body_rate, euler_from_quat, euler_rate, mrp_error, mrp_from_quat, mrp_inner, mrp_matrix, mrp_nearest,
-    mrp_product, mrp_rate, mrp_rate_transposed, quat_angle, quat_conjugate, quat_error, quat_from_euler,
-    quat_from_mrp, quat_from_vector, quat_matrix, quat_normalised, quat_rate, quat_rotate,
+    euler_body_rate,
+    euler_from_quat,
+    euler_rate,
+    mrp_error,
+    mrp_from_quat,
+    mrp_inner,
+    mrp_matrix,
+    mrp_nearest,
+    mrp_product,
+    mrp_rate,
+    mrp_rate_transposed,
+    quat_angle,
+    quat_conjugate,
+    quat_error,
+    quat_from_euler,
+    quat_from_mrp,
+    quat_from_vector,
+    quat_matrix,
+    quat_normalised,
+    quat_rate,
+    quat_rotate,
 )  # fmt: skip
 from jaxatt.engine import rk4
 from jaxatt.vec import Vec3, array, cross, norm, vec3

@@ -58,7 +58,7 @@ def plain(params, scenario, noise):
         if k % 3 == 0:
             z = -params.gain * (x[1] + 0.1 * n[0]) + 0.01 * n[1]
         out.append((x[0], z))
-        f = lambda t, x: np.array([x[1], -scenario.stiffness * x[0] + z + 0.05 * np.sin(t)])
+        f = lambda t, x, z=z: np.array([x[1], -scenario.stiffness * x[0] + z + 0.05 * np.sin(t)])
         for j in range(3):
             t = 0.2 * k + j * h
             k1 = f(t, x)
@@ -128,7 +128,9 @@ def test_a_loop_on_plain_arrays_runs_in_lanes_through_vmapped():
         np.testing.assert_allclose(lanes["x"][..., i], one["x"], rtol=1e-12)
     score = lambda params, scenario, now, log: scores.rms(log["u"] ** 2)
     swept = sweep(vmapped(ARRAYS), Params(), many(140), KEY, ticks=30, score=score)
-    single = simulate(ARRAYS, Params(), jax.tree.map(lambda a: a[139], many(140)), noise_of(ARRAYS, KEY, 139, 30), ticks=30)
+    single = simulate(
+        ARRAYS, Params(), jax.tree.map(lambda a: a[139], many(140)), noise_of(ARRAYS, KEY, 139, 30), ticks=30
+    )
     assert swept[139] == pytest.approx(float(np.sqrt(np.mean(single["u"] ** 2))), rel=1e-10)
 
 
@@ -179,7 +181,11 @@ def test_a_run_in_float32_stays_in_float32_under_x64():
         (dict(ticks=0), ValueError, "`ticks` must be a whole number of at least 1, but it is 0"),
         (dict(ticks=2.5), ValueError, "`ticks` must be a whole number of at least 1, but it is 2.5"),
         (dict(every=0), ValueError, "`every` must be a whole number of at least 1, but it is 0"),
-        (dict(noise_or_key=np.zeros((3, 2))), ValueError, r"`noise` must have shape \(10, 2, \*lanes\), but it is \(3, 2\)"),
+        (
+            dict(noise_or_key=np.zeros((3, 2))),
+            ValueError,
+            r"`noise` must have shape \(10, 2, \*lanes\), but it is \(3, 2\)",
+        ),
         (dict(noise_or_key=7), TypeError, r"`key` must be a key of jax.random.key\(seed\), but it is 7"),
         (dict(params=Params("a")), TypeError, "`params.gain` must be a number or an array, but it is 'a'"),
         (dict(noise_or_key=jax.random.split(KEY, 3)), ValueError, r"`scenario.start` must carry the lanes \(3,\)"),

@@ -109,7 +109,9 @@ def windows(params, scenario, now, log):
     """Tallies of the table of section 3 of the spec."""
     inside = [(now.t >= a) & (now.t < b) for a, b in ((60, 150), (150, 250), (250, 350))]
     qq, ww = log.e_q @ log.e_q, log.e_w @ log.e_w
-    return [(scores.mean(log.xi**2, i), scores.mean(log.alarm, i), scores.mean(qq, i), scores.mean(ww, i)) for i in inside]
+    return [
+        (scores.mean(log.xi**2, i), scores.mean(log.alarm, i), scores.mean(qq, i), scores.mean(ww, i)) for i in inside
+    ]
 
 
 @pytest.mark.parametrize(
@@ -121,7 +123,9 @@ def windows(params, scenario, now, log):
 )  # fmt: skip
 def test_the_monte_carlo_table(eps, tolerance, table):
     system = op.system._replace(substeps=4 if eps == 0.1 else 8)
-    swept = sweep(system, op.params._replace(eps=eps), lanes(op.scenario, 64), jax.random.key(21), ticks=3500, score=windows)
+    swept = sweep(
+        system, op.params._replace(eps=eps), lanes(op.scenario, 64), jax.random.key(21), ticks=3500, score=windows
+    )
     for got, (xi, share, q, w) in zip(swept, table):
         rms = [np.sqrt(a.mean()) for a in (got[0], got[2], got[3])]
         np.testing.assert_allclose(rms, [xi, q, w], rtol=tolerance)
@@ -170,7 +174,9 @@ def test_torque_saturation_holds_on_every_axis():
 
 
 def test_the_shadow_set_keeps_a_tumbling_body_inside_the_unit_ball():
-    scenario = QUIET._replace(w=Vec3(0.0, 0.0, 3.0), w_hat=Vec3(0.0, 0.0, 3.0), q=Vec3(0.0, 0.0, 0.0), q_hat=Vec3(0.0, 0.0, 0.0))
+    scenario = QUIET._replace(
+        w=Vec3(0.0, 0.0, 3.0), w_hat=Vec3(0.0, 0.0, 3.0), q=Vec3(0.0, 0.0, 0.0), q_hat=Vec3(0.0, 0.0, 0.0)
+    )
     log = simulate(op.system, op.params._replace(u_max=0.01), scenario, KEY, ticks=100)
     assert norm(log.q).max() <= 1 and log.xi[1:].max() < 0.01
 
@@ -190,7 +196,11 @@ J_FLAT = op.INERTIA._replace(z=Vec3(-1.0, 3.0, -10.0))
 @pytest.mark.parametrize(
     ("params", "scenario", "message"),
     [
-        (dict(J=J_FLAT), {}, r"`params.J` must be positive definite, but its smallest principal moment is -10\.\d+ kg m\^2"),
+        (
+            dict(J=J_FLAT),
+            {},
+            r"`params.J` must be positive definite, but its smallest principal moment is -10\.\d+ kg m\^2",
+        ),
         ({}, dict(J=J_FLAT), r"`scenario.J` must be positive definite"),
         (dict(J=op.INERTIA._replace(x=Vec3(15.0, 9.0, -1.0))), {}, "symmetric"),
         (dict(alpha=-1.0), {}, r"`params.alpha` must be a positive number, but it is -1\."),

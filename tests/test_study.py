@@ -106,9 +106,15 @@ def test_a_bad_scenario_leaves_the_others_alone(thousand):
     ("scenarios", "message"),
     [
         (lambda s: s._replace(std_q=0.1), r"`scenarios\.std_q` must carry the scenarios in its last axis"),
-        (lambda s: s._replace(std_q=np.zeros(9)), r"`scenarios\.std_q` must hold 10 scenarios in its last axis, but its"),
+        (
+            lambda s: s._replace(std_q=np.zeros(9)),
+            r"`scenarios\.std_q` must hold 10 scenarios in its last axis, but its",
+        ),
         (lambda s: first(s, 0), "`scenarios` must hold at least one scenario"),
-        (lambda s: s._replace(std_w=np.full(10, -1.0)), r"`scenario\.std_w` must not be negative, but it is -1 in scenario 0"),
+        (
+            lambda s: s._replace(std_w=np.full(10, -1.0)),
+            r"`scenario\.std_w` must not be negative, but it is -1 in scenario 0",
+        ),
     ],
 )
 def test_bad_sweeps_are_refused(scenarios, message):

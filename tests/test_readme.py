@@ -1,0 +1,26 @@
+"""The README's code runs as printed, and what it names exists."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text()
+
+
+def test_the_first_steps_run_as_printed():
+    (code,) = re.findall(r"```python\n(.*?)```", README, re.S)
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    before, after = map(int, re.search(r"after: (\d+) (\d+)", done.stdout).groups())
+    assert before == 0 and after > 250
+    first, best = map(float, re.search(r"cost (\S+) -> (\S+)", done.stdout).groups())
+    assert best < first
+
+
+def test_files_and_links_that_it_names_exist():
+    for path in re.findall(r"!\[[^]]*\]\(([^)]+)\)", README) + re.findall(r"`((?:notebooks|jaxatt)/[\w/.]+)`", README):
+        assert (ROOT / path).exists(), path
+    for name in re.findall(r"`jaxatt\.systems\.(\w+)`", README):
+        assert (ROOT / "jaxatt" / "systems" / f"{name}.py").exists(), name
