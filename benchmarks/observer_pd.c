@@ -122,7 +122,7 @@ INLINE void two_normals(Generator *g, F *a, F *b) {
     F log_m = __builtin_convertvector(e, F) * 0.6931471806f + (f * f * (p * f - 0.5f) + f);
     F r = rootf((F)((I)(-2 * log_m) & 0x7fffffff)); /* -2 log 1 may come out as -0 */
     r = (F)((U)r | (v << 31)); /* a sign for both, so that half a circle will do */
-    F t = __builtin_convertvector((I)(v >> 8) - 0x800000, F) * 0x1.921fb6p-24f; /* [-pi/2, pi/2) */
+    F t = __builtin_convertvector((I)(v >> 8) - 0x800000, F) * 0x1.921fb6p-23f; /* [-pi/2, pi/2) */
     F q = t * t;
     F s = (((2.6083159809786593e-6f * q - 1.981069071916863e-4f) * q + 8.333078585565090e-3f) * q - 1.6666659712791443e-1f)
               * q * t + t;

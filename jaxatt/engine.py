@@ -389,7 +389,7 @@ def _jitted(f: Callable, static: int, plain: bool):
 
 _FLAGS = {
     "--xla_cpu_prefer_vector_width": "512",
-    "--xla_backend_extra_options": "xla_cpu_small_while_loop_byte_threshold=100000000",
+    "--xla_backend_extra_options": "xla_cpu_small_while_loop_byte_threshold=2000000",
 }
 
 
