@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import jax.numpy as jnp
 
 from jaxatt.vec import Vec3, norm, safe_sqrt
@@ -33,3 +35,71 @@ def adapted_rate_gain(k_w, e_q: Vec3, e_w: Vec3, eps, lambda_max, dt):
 def saturated(u: Vec3, u_max) -> Vec3:
     """u with every axis limited to +-u_max."""
     return Vec3(*(jnp.clip(a, -u_max, u_max) for a in u))
+
+
+# model-reference adaptive control of a first-order plant
+
+
+class Adaptation(NamedTuple):
+    """Numbers of the adaptation law (6) of Eun et al. (2016); the defaults leave it as it is. Shapes (*lanes).
+
+    Speeds are in deg/s. A gain given for rad/s is (pi / 180)^2 times as large here (spec, 3.1).
+    """
+
+    gamma: Any = 1e-6  # [s/deg^2] adaptation gain
+    sign: Any = 1.0  # [1] sgn(b_p) as the computer believes it
+    normalise: Any = 0.0  # [s^2/deg^2] c: gamma is divided by 1 + c (r^2 + y^2)
+    leak: Any = 0.0  # [1/s] sigma modification: the parameters decay at this rate
+    limit: Any = jnp.inf  # [1] projection: |a_r| and |a_y| do not grow beyond
+
+
+class Mrac(NamedTuple):
+    """State of the controller. Shapes (*lanes)."""
+
+    y_m: Any  # [deg/s] output of the reference model
+    a_r: Any  # [1] parameter on the reference input
+    a_y: Any  # [1] parameter on the plant's output
+
+
+def mrac_input(mrac: Mrac, r, y):
+    """u = a_r r + a_y y [deg/s], Eun et al. (2016), eq. (5); r: reference input, y: plant output [deg/s]."""
+    return mrac.a_r * r + mrac.a_y * y
+
+
+def mrac_flow(mrac: Mrac, law: Adaptation, r, y, a_m, b_m) -> Mrac:
+    """Rate of change of the controller's state, Eun et al. (2016), eqs. (2), (4), (6).
+
+    r: reference input, y: plant output [deg/s]; a_m, b_m: reference model [1/s].
+    """
+    e = y - mrac.y_m  # eq. (4)
+    g = law.sign * law.gamma / (1 + law.normalise * (r * r + y * y))
+    return Mrac(
+        y_m=b_m * r - a_m * mrac.y_m,  # eq. (2)
+        a_r=_projected(mrac.a_r, -g * e * r - law.leak * mrac.a_r, law.limit),  # eq. (6)
+        a_y=_projected(mrac.a_y, -g * e * y - law.leak * mrac.a_y, law.limit),
+    )
+
+
+def mrac_step(mrac: Mrac, law: Adaptation, r, y, dt) -> Mrac:
+    """The parameters after one forward-Euler step of the adaptation (6) over dt [s]; y_m is left alone.
+
+    This is how a computer samples the law; it is stable only within `mrac_sampled_bound`.
+    """
+    rate = mrac_flow(mrac, law, r, y, 0.0, 0.0)
+    a_r, a_y = mrac.a_r + dt * rate.a_r, mrac.a_y + dt * rate.a_y
+    return mrac._replace(a_r=jnp.clip(a_r, -law.limit, law.limit), a_y=jnp.clip(a_y, -law.limit, law.limit))
+
+
+def mrac_sampled_bound(law: Adaptation, dt, a_p, b_p, a_y=0.0):
+    """The largest r^2 + y^2 [deg^2/s^2] at which `mrac_step` with a held command is stable (spec, 3.5).
+
+    Near the matching line the sampled loop is stable if r^2 + y^2 < (a_p / b_p - a_y) / (gamma dt); normalisation
+    makes gamma smaller by 1 + c (r^2 + y^2), and no bound remains once c is large enough.
+    """
+    room = (a_p / jnp.abs(b_p) - law.sign * a_y) / dt
+    slack = law.gamma - room * law.normalise
+    return jnp.where(slack > 0, room / jnp.where(slack > 0, slack, 1), jnp.inf)
+
+
+def _projected(a, rate, limit):
+    return jnp.where((jnp.abs(a) >= limit) & (a * rate > 0), 0, rate)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
+
 from jaxatt.attitude import mrp_rate, mrp_rate_transposed
 from jaxatt.vec import Mat3, Vec3, cross, once, safe_sqrt
 
@@ -36,3 +38,25 @@ def residual_norm(y: AttitudeRate, estimate: AttitudeRate):
     """|xi|: norm of reading minus estimate, MRP and rad/s added without weights as in the paper."""
     xi_q, xi_w = y.q - estimate.q, y.w - estimate.w
     return safe_sqrt(xi_q @ xi_q + xi_w @ xi_w)
+
+
+# recursive least squares
+
+
+class LeastSquares(NamedTuple):
+    """An estimate of a in y = W a and its gain. Shapes (*lanes)."""
+
+    a: Any  # estimate of the parameter
+    P: Any  # [1/(W^2 s)] gain
+
+
+def least_squares(estimate: LeastSquares, W, y, dt, forget=0.0) -> LeastSquares:
+    """The estimate after dt [s] in which the regressor W and the output y were constant.
+
+    Eun et al. (2016), eqs. (9), (10): a' = -P W (W a - y), P' = -P W^2 P, here in the rational form that is their
+    exact solution, stable for every dt and never P < 0; forward Euler makes P negative once P W^2 dt > 1 (spec,
+    3.5). forget [1/s]: rate at which old data lose weight; without excitation P then grows without bound, and
+    the caller limits it.
+    """
+    P = estimate.P / (jnp.exp(-forget * dt) + estimate.P * W * W * dt)
+    return LeastSquares(a=estimate.a - P * W * (W * estimate.a - y) * dt, P=P)

@@ -169,3 +169,24 @@ def add(a, b):
 def values(tree):
     """The numbers of a tree of tallies."""
     return jax.tree.map(lambda tally: tally.value(), tree, is_leaf=is_tally)
+
+
+# more tallies
+
+
+class Span(NamedTuple):
+    """Largest minus smallest value in a window; NaN if it held no tick."""
+
+    largest: Any = -jnp.inf
+    smallest: Any = jnp.inf
+
+    def __add__(self, later):
+        return Span(jnp.maximum(self.largest, later.largest), jnp.minimum(self.smallest, later.smallest))
+
+    def value(self):
+        return jnp.where(self.largest == -jnp.inf, jnp.nan, self.largest - self.smallest)
+
+
+def span(value, inside: Any = True) -> Span:
+    """Tally how far apart the extremes of value lie over the ticks where ``inside`` holds."""
+    return Span(_where(inside, value, -jnp.inf), _where(inside, value, jnp.inf))

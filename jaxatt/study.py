@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections import deque
 from collections.abc import Callable
+from functools import lru_cache
 from math import prod
 from typing import Any, NamedTuple
 
@@ -182,3 +183,22 @@ def tune(cost: Callable, theta, optimizer, steps: int, key, *, progress: bool | 
     thetas, values, sizes, factors = zip(*trail)
     stacked = jax.tree.map(lambda *a: np.stack(a), *thetas)
     return best[1], History(stacked, np.array(values), np.array(sizes), np.array(factors))
+
+
+@lru_cache
+def varied(system: System) -> System:
+    """The same loop with its params as part of the scenario: a design study as a sweep.
+
+    Its params are ``()`` and its scenarios pairs (params, scenario), so every number of both may differ from
+    scenario to scenario.
+    """
+
+    def unpacked(f):
+        return lambda _, pair, *rest: f(*pair, *rest)
+
+    return system._replace(**{name: unpacked(getattr(system, name)) for name in ("init", "tick", "flow", "check")})
+
+
+def batch(tree, n: int):
+    """The tree with n scenarios in the last axis of every leaf that carries none, leaves of shape () or (n,)."""
+    return jax.tree.map(lambda leaf: np.broadcast_to(np.asarray(leaf), (n,)), tree)

@@ -1,0 +1,637 @@
+"""The wheel test bed: its parts' laws, a plain NumPy oracle of the loop, the paper's and the spec's numbers."""
+
+import jax
+
+jax.config.update("jax_enable_x64", True)
+
+import inspect  # noqa: E402
+import warnings  # noqa: E402
+
+import jax.numpy as jnp  # noqa: E402
+import numpy as np  # noqa: E402
+import pytest  # noqa: E402
+
+import jaxatt  # noqa: E402
+from jaxatt import scores  # noqa: E402
+from jaxatt.bodies import Wheel, beyond, gated, wheel_acceleration  # noqa: E402
+from jaxatt.controllers import Adaptation, Mrac, mrac_flow, mrac_input, mrac_sampled_bound, mrac_step  # noqa: E402
+from jaxatt.estimators import LeastSquares, least_squares  # noqa: E402
+from jaxatt.faults import Fault  # noqa: E402
+from jaxatt.study import batch, varied  # noqa: E402
+from jaxatt.systems import wheel_mrac as wm  # noqa: E402
+
+TICKS = 4501  # 0 to 90 s
+QUIET = wm.scenario._replace(noise=0.0)
+SILENCE = jnp.zeros((TICKS, 3))
+
+
+def uniform(seed, amplitude=0.05, ticks=TICKS):
+    """Uniform attitude noise of NumPy's generator as a noise array for one scenario."""
+    return wm.normals_of(np.random.default_rng(seed).uniform(-amplitude, amplitude, ticks), amplitude)
+
+
+def portable(ticks, amplitude=0.05, seed=12345):
+    """The spec's linear congruential noise (spec, 1.2)."""
+    v = []
+    for _ in range(ticks):
+        seed = (1103515245 * seed + 12345) % 2**31
+        v.append(amplitude * (2 * seed / 2**31 - 1))
+    return np.array(v)
+
+
+def together(pairs, noise, system=wm.system, ticks=TICKS):
+    """Logs, as NumPy arrays with lanes, of several (params, scenario) that meet the same noise."""
+    pairs = jax.tree.map(lambda *leaves: np.array(leaves, float), *pairs)
+    n = len(pairs[0].K)
+    noise = jnp.broadcast_to(noise[..., None], (*noise.shape, n))
+    return jax.tree.map(np.asarray, jaxatt.simulate(varied(system), (), pairs, noise, ticks=ticks))
+
+
+def rms(a):
+    return np.sqrt(np.mean(np.square(a), axis=0))
+
+
+# the wheel
+
+
+def test_wheel_is_equation_3_where_nothing_spoils_it():
+    y, u = np.random.default_rng(0).normal(size=(2, 50)) * 5000
+    np.testing.assert_allclose(wheel_acceleration(Wheel(), y, u), -10 * y + 20 * u, rtol=1e-13)
+
+
+def test_friction_takes_energy_and_fades_with_speed():
+    wheel = Wheel(friction=25000.0)
+    y = np.array([-3000.0, -700.0, -50.0, 50.0, 700.0, 3000.0])
+    lost = wheel_acceleration(Wheel(), y, 0.0) - wheel_acceleration(wheel, y, 0.0)
+    assert np.all(lost * y > 0)
+    np.testing.assert_allclose(lost, 25000 * np.exp(-((y / 1500) ** 2)) * np.tanh(y / 100), rtol=1e-12)
+
+
+def test_coulomb_friction_is_a_dead_zone_of_the_command_while_the_wheel_turns():
+    y, u = 4000.0, 3000.0
+    coulomb = wheel_acceleration(Wheel(friction=25000.0, slow=jnp.inf), y, u)
+    np.testing.assert_allclose(coulomb, wheel_acceleration(Wheel(dead_zone=1250.0), y, u), rtol=1e-12)
+
+
+def test_dead_zone_gate_and_bound():
+    u = np.array([-3.0, -0.5, 0.0, 0.5, 3.0])
+    np.testing.assert_allclose(beyond(u, 1.0), [-2, 0, 0, 0, 2])
+    assert jax.grad(beyond)(0.0, 0.0) == 1  # no dead zone: no kink at zero either
+    np.testing.assert_allclose(gated(u, 1.0), [-3, 0, 0, 0, 3])
+    np.testing.assert_allclose(gated(u, 0.0), u)
+    np.testing.assert_allclose(wheel_acceleration(Wheel(u_max=1.0), 0.0, u), 20 * np.clip(u, -1, 1))
+    assert np.all(np.diff(gated(np.linspace(0.9, 1.2, 400), 1.0)) >= 0)
+
+
+@pytest.mark.parametrize(
+    "wheel",
+    [
+        Wheel(),
+        Wheel(friction=25000.0, slow=np.inf),
+        Wheel(dead_zone=1250.0),
+        Wheel(gate=2000.0),
+        Wheel(weakness=0.98),
+        Wheel(stiction=3e4),
+        Wheel(u_max=1000.0),
+    ],
+)
+def test_wheel_has_finite_gradients_everywhere(wheel):
+    for y in (0.0, 1e-3, 1500.0, 1e9):
+        for u in (0.0, 1000.0, 2000.0):
+            grads = jax.grad(wheel_acceleration, (0, 1, 2))(jax.tree.map(float, wheel), y, u)
+            assert np.isfinite(jax.tree.leaves(grads)).all()
+
+
+# adaptive control
+
+
+@pytest.mark.parametrize("b_p", [20.0, -20.0])
+def test_lyapunov_identity(b_p):
+    """V = e^2/2 + |b_p| / (2 gamma) (a_r~^2 + a_y~^2) falls as -a_m e^2 (spec, 5.4), for either sign of b_p."""
+    a_p, a_m, b_m = 8.0, 10.0, 10.0
+    law = Adaptation(gamma=1e-6, sign=np.sign(b_p))
+    r, y, y_m, a_r, a_y = np.random.default_rng(1).normal(size=(5, 100)) * [[1e4], [1e4], [1e4], [1], [1]]
+    mrac = Mrac(y_m, a_r, a_y)
+    rate = mrac_flow(mrac, law, r, y, a_m, b_m)
+    y_rate = wheel_acceleration(Wheel(a=a_p, b=b_p), y, mrac_input(mrac, r, y))
+    e = y - y_m
+    off_r, off_y = a_r - b_m / b_p, a_y - (a_p - a_m) / b_p
+    v_rate = e * (y_rate - rate.y_m) + abs(b_p) / law.gamma * (off_r * rate.a_r + off_y * rate.a_y)
+    np.testing.assert_allclose(v_rate, -a_m * e * e, rtol=1e-9, atol=1e-3)
+
+
+def test_options_of_the_adaptation():
+    mrac, r, y = Mrac(90.0, 1.0, -2.0), 300.0, 100.0
+    plain = mrac_flow(mrac, Adaptation(), r, y, 10.0, 10.0)
+    np.testing.assert_allclose([plain.a_r, plain.a_y], [-1e-6 * 10 * 300, -1e-6 * 10 * 100])
+    slower = mrac_flow(mrac, Adaptation(normalise=1e-4), r, y, 10.0, 10.0)
+    np.testing.assert_allclose(slower.a_r, plain.a_r / (1 + 1e-4 * 1e5))
+    leaky = mrac_flow(mrac, Adaptation(leak=0.1), r, y, 10.0, 10.0)
+    np.testing.assert_allclose([leaky.a_r - plain.a_r, leaky.a_y - plain.a_y], [-0.1, 0.2])
+    walled = mrac_flow(mrac, Adaptation(limit=1.0), r, y, 10.0, 10.0)
+    np.testing.assert_allclose([walled.a_r, walled.a_y], [plain.a_r, 0.0])  # one falls from its wall, one would leave
+    stepped = mrac_step(mrac, Adaptation(), r, y, 0.02)
+    np.testing.assert_allclose(stepped, [90.0, 1 + 0.02 * plain.a_r, -2 + 0.02 * plain.a_y])
+    assert mrac_step(Mrac(0.0, 1.0, -1.0), Adaptation(gamma=1.0, limit=1.0), -r, y, 1.0).a_r == 1.0
+
+
+def spectral_radius(speed, gamma=1e-6, dt=wm.DT):
+    """Of one tick of the sampled loop at y = y_m = r = speed on the matching line; without the neutral direction."""
+    law = Adaptation(gamma=gamma)
+
+    def one_tick(v):
+        y, a_r, a_y = v
+        mrac = Mrac(speed, a_r, a_y)
+        u = mrac_input(mrac, speed, y)
+        step = lambda y, _: (jaxatt.rk4(lambda t, y: wheel_acceleration(Wheel(), y, u), 0.0, y, dt / 20), None)
+        y, _ = jax.lax.scan(step, y, None, length=20)
+        mrac = mrac_step(mrac, law, speed, v[0], dt)
+        return jnp.array([y, mrac.a_r, mrac.a_y])
+
+    values = np.linalg.eigvals(np.asarray(jax.jit(jax.jacfwd(one_tick))(jnp.array([speed, 0.5, 0.0]))))
+    neutral = np.argmin(np.abs(values - 1))  # a_r r + a_y y stays
+    np.testing.assert_allclose(values[neutral], 1, atol=1e-9)
+    return np.abs(np.delete(values, neutral)).max()
+
+
+def test_bound_of_sampled_adaptation():
+    radii = [spectral_radius(3500.0), spectral_radius(3540.0), spectral_radius(19257.0)]
+    assert np.all(np.abs(np.array(radii) - [0.9982, 1.0002, 2.49]) <= [1e-4, 1e-4, 5e-3])
+    law = Adaptation(gamma=1e-6)
+    limits = [np.sqrt(mrac_sampled_bound(law, wm.DT, 10.0, 20.0, a_y) / 2) for a_y in (0.0, -0.2)]
+    np.testing.assert_allclose(limits, [3535.5, 4183.3], atol=0.1)
+    assert abs(spectral_radius(limits[0]) - 1) < 1e-3 > abs(spectral_radius(limits[0] * 10, 1e-8) - 1)
+    normalised = Adaptation(gamma=1e-6, normalise=1e-8)
+    bound = mrac_sampled_bound(normalised, wm.DT, 10.0, 20.0)
+    np.testing.assert_allclose(1e-6 / (1 + 1e-8 * bound) * bound * wm.DT, 0.5, rtol=1e-12)
+    assert mrac_sampled_bound(Adaptation(gamma=1e-6, normalise=1e-6), wm.DT, 10.0, 20.0) == np.inf
+
+
+# least squares
+
+
+def test_least_squares_solves_its_equations_exactly():
+    """For a constant regressor one long step, many short ones and the closed form agree."""
+    start, W, y, t = LeastSquares(-1.4e-4, 1e-6), 4e4, -5.0, 3.0
+    once = least_squares(start, W, y, t)
+    many = start
+    for _ in range(300):
+        many = least_squares(many, W, y, t / 300)
+    decay = 1 / (1 + start.P * W**2 * t)
+    np.testing.assert_allclose(once, [y / W + (start.a - y / W) * decay, start.P * decay], rtol=1e-12)
+    np.testing.assert_allclose(many, once, rtol=1e-12)
+    assert least_squares(start, 1e9, y, t).P > 0  # forward Euler: -2e6
+    assert least_squares(start, 0.0, y, t) == start
+
+
+def test_least_squares_is_weighted_regression():
+    """With forgetting the estimate minimises the exponentially weighted squares, prior included."""
+    rng = np.random.default_rng(3)
+    W, dt, forget = rng.normal(size=40), 0.1, 0.7
+    y = 2 * W + rng.normal(size=40)
+    estimate = LeastSquares(0.5, 4.0)
+    for w, v in zip(W, y):
+        estimate = least_squares(estimate, w, v, dt, forget)
+    age = np.arange(40)[::-1]
+    weight = dt * np.exp(-forget * dt * age)
+    prior = np.exp(-forget * dt * 40) / 4.0
+    expected = (prior * 0.5 + weight @ (W * y)) / (prior + weight @ W**2)
+    np.testing.assert_allclose(estimate.a, expected, rtol=1e-12)
+    np.testing.assert_allclose(estimate.P, 1 / (prior + weight @ W**2), rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("regressor", "P0", "J"),
+    [
+        ("attitude", 1e-6, 5.42099997),
+        ("attitude", 1e-6 * wm.PER_RAD2, 5.420912),
+        ("rate", 1e-6, 5.420949),
+        ("rate", 1e-6 * wm.PER_RAD2, 5.300715),
+    ],
+)
+def test_closed_form_of_the_estimate(regressor, P0, J):
+    """a~ = a~(0) / (1 + P0 int W^2) over the slew (spec, 3.3), by the estimator itself on noise-free data."""
+    t = (np.arange(4500) + 0.5) * wm.DT
+    a = -wm.J_WHEEL / 5.421
+    W = (np.asarray(wm.slew(wm.params, t)[0]) if regressor == "attitude" else wm.slew(wm.params, t)[1]) / a
+
+    def step(estimate, w):
+        return least_squares(estimate, w, w * a, wm.DT), None
+
+    estimate, _ = jax.lax.scan(step, LeastSquares(jnp.asarray(-wm.J_WHEEL / 5), jnp.asarray(P0)), jnp.asarray(W))
+    np.testing.assert_allclose(-wm.J_WHEEL / estimate.a, J, atol=1e-5)
+    start = 1 / 5 - 1 / 5.421
+    np.testing.assert_allclose(1 / (1 / 5.421 + start / (1 + P0 * np.sum(W**2) * wm.DT)), J, atol=1e-5)
+
+
+# the loop against a plain oracle
+
+
+def oracle(params, scenario, v, ticks, substeps, sampled):
+    """The loop of the spec's 1.2 and 4 written down once more, in plain floats. Rows: theta, y, a_r, a_y, r, a, P."""
+    p, s, dt = params, scenario, wm.DT
+    a_z = -s.J_w / s.J_z
+    theta_w = y = y_m = 0.0
+    ar, ay, a_hat, P = p.a_r, p.a_y, -p.J_w / p.J_hat, p.P0
+    rows = []
+    for k in range(ticks):
+        t = k * dt
+        measured = a_z * theta_w + v[k]
+        if p.ope and k:
+            P = P / (1 + P * theta_w**2 * dt)
+            a_hat = a_hat - P * theta_w * (theta_w * a_hat - measured) * dt
+        arg = 5 * (t - p.duration / 2) / p.duration
+        target = p.turn / 2 * (np.tanh(arg) / np.tanh(2.5) + 1)
+        rate = p.turn / 2 * 5 / p.duration / np.cosh(arg) ** 2 / np.tanh(2.5)
+        r = (rate + p.K * (target - (a_hat * theta_w if p.ope else measured))) / a_hat
+        rows.append([a_z * theta_w, y, ar, ay, r, a_hat, P])
+        held = ar * r + ay * y
+
+        def f(state, r=r, held=held):
+            y, y_m, _, ar, ay = state
+            u = held if sampled else ar * r + ay * y
+            fade = np.exp(-((y / s.wheel.slow) ** 2)) * np.tanh(y / s.wheel.creep)
+            slope = 0.0 if sampled else -p.law.gamma * (y - y_m)
+            y_rate = -s.wheel.a * y + s.wheel.b * u - s.wheel.friction * fade
+            return np.array([y_rate, -p.a_m * y_m + p.b_m * r, y, slope * r, slope * y])
+
+        euler = -p.law.gamma * (y - y_m) * dt if sampled else 0.0
+        state, h = np.array([y, y_m, theta_w, ar + euler * r, ay + euler * y]), dt / substeps
+        for _ in range(substeps):
+            k1 = f(state)
+            k2 = f(state + h / 2 * k1)
+            k3 = f(state + h / 2 * k2)
+            k4 = f(state + h * k3)
+            state = state + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        y, y_m, theta_w, ar, ay = state
+    return np.array(rows)
+
+
+@pytest.mark.parametrize(
+    ("params", "scenario", "sampled"),
+    [
+        (wm.mrac_only, wm.scenario, False),
+        (wm.params, wm.scenario, False),
+        (wm.hardware_params, wm.hardware_scenario._replace(noise=0.05), True),
+    ],
+)
+def test_loop_agrees_with_the_oracle(params, scenario, sampled):
+    ticks, v = 400, portable(400)
+    np.testing.assert_allclose(v[:3], [0.0155154048, -0.0195185677, 0.0174960634], atol=1e-10)
+    system = wm.loop(sampled=sampled, substeps=5)
+    log = jaxatt.simulate(system, params, scenario, wm.normals_of(v, 0.05), ticks=ticks)
+    ours = np.stack([log.theta, log.y, log.a_r, log.a_y, log.r, -params.J_w / log.J_hat, log.P], axis=1)
+    theirs = oracle(params, scenario, v, ticks, 5, sampled)
+    scale = np.abs(theirs).max(0)
+    np.testing.assert_allclose(ours / scale, theirs / scale, atol=1e-10)
+
+
+# the spec's numbers
+
+
+@pytest.fixture(scope="module")
+def noise_free():
+    return together([(wm.mrac_only, QUIET), (wm.params, QUIET)], SILENCE)
+
+
+def test_noise_free_paper_case(noise_free):
+    """Spec, 8.1."""
+    log = noise_free
+    np.testing.assert_allclose(np.abs(log.error).max(0), [0.21402, 0.03614], atol=1e-4)
+    np.testing.assert_allclose([log.a_r[-1, 0], log.a_y[-1, 0]], [0.70477, -0.20253], atol=1e-4)
+    np.testing.assert_allclose(log.J_hat[[1000, 4500], 1], [5.42091, 5.42100], atol=1e-4)
+    np.testing.assert_allclose(log.target[[0, -1], 0], [0, 90], atol=1e-12)
+    np.testing.assert_allclose(log.target_rate[[0, 2250, -1], 0], [0.0673825, 2.5339183, 0.0673825], atol=1e-7)
+    ideal = -log.r_ideal[[0, 1000, 2250, 3000], 0] * 1.0
+    np.testing.assert_allclose(ideal, [512.10, 4245.15, 19257.49, 10293.49], atol=0.01)
+
+
+def test_integration_has_converged():
+    """Spec, 1.2: 20 against 40 substeps, 6e-13 deg and 3.5e-7 deg/s there; the order of the method besides."""
+    ends = [jaxatt.simulate(wm.loop(substeps=n), wm.params, QUIET, SILENCE[:2300], ticks=2300) for n in (10, 20, 40)]
+    coarse, fine = (np.abs(ends[i].y - ends[2].y).max() for i in (0, 1))
+    assert fine < 1e-6 and 12 < coarse / fine < 22
+    assert np.abs(ends[1].theta - ends[2].theta).max() < 1e-11
+
+
+def test_uniform_noise():
+    """Spec, 8.2, with NumPy's generator, seed 1."""
+    log = together([(wm.mrac_only, wm.scenario), (wm.params, wm.scenario)], uniform(1), wm.loop(substeps=8))
+    late = slice(500, None)
+    assert 0.255 < np.abs(log.measured[:, 0]).max() < 0.272
+    peaks, levels = np.abs(log.measured[late]).max(0), rms(log.measured[late])
+    assert 0.22 < peaks[1] / peaks[0] < 0.25
+    assert abs(levels[1] / levels[0] - 0.25) < 0.01
+    np.testing.assert_allclose(log.J_hat[-1, 1], 5.4210, atol=2e-4)
+    assert np.all(np.abs(rms(np.diff(log.r[late], axis=0)) - [287, 10.5]) <= [10, 0.2])
+    np.testing.assert_allclose([log.a_r[-1, 0], log.a_y[-1, 0]], [0.670, -0.169], atol=1e-3)
+
+
+def test_gaussian_noise_and_the_scores_of_a_sweep():
+    """Spec, 3.2: a standard deviation of 0.05/3 fits the paper (0.259 deg), one of 0.05 does not (0.355)."""
+    n = 128
+    spread = np.where(np.arange(n) < n // 2, 0.05 / 3, 0.05)
+    scenarios = batch(wm.scenario, n)._replace(uniform=np.zeros(n), noise=spread)
+    system = wm.loop(substeps=8)
+    got = jaxatt.sweep(system, wm.mrac_only, scenarios, jax.random.key(0), ticks=TICKS, score=wm.score)
+    assert got.ok.all() and np.isinf(got.failed_at).all() and np.isinf(got.flipped_at).all()
+    small, large = got.peak_measured[: n // 2], got.peak_measured[n // 2 :]
+    assert abs(np.median(small) - 0.259) < 0.01 and abs(np.median(large) - 0.355) < 0.03
+    log = jaxatt.rerun(system, wm.mrac_only, scenarios, jax.random.key(0), 3, ticks=TICKS)
+    np.testing.assert_allclose(np.abs(log.measured).max(), got.peak_measured[3])
+    np.testing.assert_allclose(rms(np.diff(log.r[499:])), got.chatter[3])
+    np.testing.assert_allclose(np.ptp((log.r - log.r_ideal)[1000:3000]), got.spans[1][3])
+    np.testing.assert_allclose(np.abs(log.error[3000:]).max(), got.peaks[2][3])
+
+
+@pytest.mark.parametrize(
+    ("onset", "residual", "error", "settling"),
+    [
+        (45.0, [259.8, 1009.8, 2294.9, 5643.8], [0.01395, 0.01395, 0.01395, 0.05922], [0, 0, 0, 0.16]),
+        (15.0, [205.7, 634.9, 1411.8, 2370.3], [0.01395, 0.01986, 0.05897, 0.16528], [0, 0, 0.66, 2.22]),
+    ],
+)
+def test_loss_of_effectiveness(onset, residual, error, settling):
+    """Spec, 6, first table; NumPy's generator, seed 1."""
+    scales = [1.0, 0.8, 0.5, 0.2, 0.05]
+    pairs = [(wm.params, wm.scenario._replace(drive=Fault(onset=onset, scale=s))) for s in scales]
+    bounded = wm.scenario._replace(drive=Fault(onset=onset, scale=0.5), wheel=Wheel(u_max=10000.0))
+    log = together([*pairs, (wm.params, bounded)], uniform(1), wm.loop(substeps=8))
+    # half of 20 * 10000 cannot hold 10 * 19257: the wheel falls short, and the attitude with it
+    assert np.abs(log.y[2500:, 5]).max() < 10000 * 1.01 and np.abs(log.error[:, 5]).max() > 5
+    log = jax.tree.map(lambda a: a[:, :5], log)
+    ill = slice(round(onset / wm.DT), None)
+    np.testing.assert_allclose(np.abs(log.residual[ill]).max(0)[1:], residual, rtol=0.02)
+    np.testing.assert_allclose(np.abs(log.error[ill]).max(0)[1:], error, rtol=0.02)
+    np.testing.assert_allclose((log.a_r + log.a_y)[-1, 1:], [0.62660, 0.99985, 2.4942, 9.9702], rtol=0.02)
+    alarms = log.alarm[ill]
+    assert not alarms[:, 0].any() and np.all(np.argmax(alarms[:, 1:], axis=0) == 1)  # 0.02 s
+    outside = np.abs(log.error[ill]) > 0.05
+    last = [wm.DT * np.nonzero(o)[0][-1] if o.any() else 0.0 for o in outside.T[1:]]
+    np.testing.assert_allclose(last, settling, rtol=0.02, atol=1e-9)
+
+
+def test_friction_growth():
+    """Spec, 6: friction that comes at 60 s is seen only once the wheel is slow."""
+    sizes = np.array([1e4, 3e4, 1e5, 3e5])
+    params = wm.hardware_params._replace(J_hat=5.0, ope=1.0)
+    pairs = [
+        (params, wm.scenario._replace(wheel=Wheel(creep=max(100.0, F / 300)), friction=Fault(onset=60.0, bias=F)))
+        for F in sizes
+    ]
+    log = together(pairs, uniform(1), wm.sampled)
+    np.testing.assert_allclose(np.argmax(log.alarm[3000:], axis=0) * wm.DT, [15.38, 13.74, 12.38, 11.38], rtol=0.02)
+    np.testing.assert_allclose(np.abs(log.error[3000:]).max(0), [0.082, 0.205, 0.473, 0.667], rtol=0.02)
+
+
+def test_hardware():
+    """Spec, 4 and 8.5: hunting at both ends, quiet between."""
+    variants = [
+        (wm.hardware_params, wm.hardware_scenario),
+        (wm.hardware_params, wm.hardware_scenario._replace(wheel=Wheel())),
+        (wm.hardware_params, wm.hardware_scenario._replace(wheel=Wheel(weakness=0.98))),
+        (wm.hardware_params, wm.hardware_scenario._replace(wheel=Wheel(stiction=3e4))),
+    ]
+    log = together(variants, uniform(1, 0.01), wm.sampled)
+    windows = [slice(0, 1000), slice(1000, 3000), slice(3000, None)]
+    peaks = np.array([np.abs(log.error[w]).max(0) for w in windows]).T
+    spans = np.array([np.ptp((log.r - log.r_ideal)[w], axis=0) for w in windows]).T
+    assert peaks[0].max() < 0.25 and spans[0, 0] >= 3 * spans[0, 1] <= spans[0, 2]
+    np.testing.assert_allclose(spans[0], [2329, 445, 1469], rtol=2e-3)
+    expected = [[0.235, 0.028, 0.163], [0.006, 0.013, 0.012], [0.087, 0.013, 0.012], [0.280, 0.013, 0.241]]
+    np.testing.assert_allclose(peaks, expected, atol=6e-4)
+
+
+def test_disturbance_that_the_prediction_does_not_see():
+    """Spec, 3.2: an attitude ramp of 0.01 deg/s; the error of MRAC only is small, that with estimation is not."""
+    params = [wm.mrac_only._replace(J_hat=5.421), wm.params._replace(J_hat=5.421)]
+    blended = params[1]._replace(blend=1.0)
+    log = together(
+        [(p, QUIET._replace(momentum=0.01 * 5.421)) for p in (*params, blended)], SILENCE, wm.loop(substeps=8)
+    )
+    np.testing.assert_allclose(np.abs(log.error).max(0)[:2], [0.043, 0.202], atol=5e-4)
+    np.testing.assert_allclose(log.J_hat[-1, 1], 5.373, atol=5e-4)
+    assert np.abs(log.error[:, 2]).max() < 0.1  # measured attitude in the feedback
+
+
+def test_momentum_and_torque():
+    """J_z w_z + J_w w_w = h + int tau, the balance behind eq. (1)."""
+    scenario = QUIET._replace(momentum=0.3, torque=1e-3)
+    log = jaxatt.simulate(wm.loop(substeps=4), wm.params, scenario, SILENCE[:500], ticks=500)
+    total = 5.421 * np.asarray(log.rate) + wm.J_WHEEL * np.asarray(log.y)
+    np.testing.assert_allclose(total, 0.3 + np.rad2deg(1e-3) * np.arange(500) * wm.DT, atol=1e-12)
+
+
+# failures
+
+
+def test_divergence_is_flagged_and_stays_in_its_lane():
+    """Spec, 8.4: at 50 Hz gamma = 1e-6 diverges, 1e-8 does not; a mis-set sign diverges at once."""
+    gains = [Adaptation(gamma=1e-6), Adaptation(gamma=1e-8), Adaptation(gamma=1e-8, sign=-1.0)]
+    pairs = [(wm.mrac_only._replace(law=law), QUIET) for law in gains]
+    with pytest.warns(
+        UserWarning, match=r"gamma` = 1e-06 s/deg\^2, sampled every 0.02 s, .* up to 3536 .* needs 19257"
+    ):
+        log = together(pairs, SILENCE[:2000], wm.loop(sampled=True, substeps=5), ticks=2000)
+    failed = log.failed
+    assert failed[-1].tolist() == [True, False, True]
+    assert 30 < np.argmax(failed[:, 0]) * wm.DT < 40
+    assert np.isnan(log.error[failed[:, 0], 0]).all() and np.isfinite(log.error[~failed[:, 0], 0]).all()
+    scenarios = batch(QUIET, 2)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        got = jaxatt.sweep(
+            varied(wm.loop(sampled=True, substeps=5)),
+            (),
+            (batch(pairs[0][0], 2)._replace(law=batch(gains[0], 2)._replace(gamma=np.array([1e-6, 1e-8]))), scenarios),
+            jax.random.key(0),
+            ticks=2000,
+            score=lambda _, pair, now, log: (lambda s: (s.ok, s.failed_at, s.unstable_at, s.J_hat))(
+                wm.score(*pair, now, log)
+            ),
+        )
+    ok, failed_at, unstable_at, _ = got
+    assert ok.tolist() == [False, True] and np.isinf(failed_at[1]) and np.isinf(unstable_at[1])
+    np.testing.assert_allclose(failed_at[0], np.argmax(failed[:, 0]) * wm.DT, atol=1e-9)
+    assert 15 < unstable_at[0] < 25.96
+
+
+def test_gradient_past_a_divergence_is_finite():
+    system = wm.loop(sampled=True, substeps=2)
+
+    def cost(log_gamma):
+        params = wm.mrac_only._replace(law=Adaptation(gamma=jnp.exp(log_gamma)))
+        log = jaxatt.simulate(system, params, QUIET, SILENCE[:1900], ticks=1900)
+        return jnp.sum(jnp.where(log.failed, 0, log.error) ** 2), log.failed[-1]
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        (value, failed), gradient = jax.value_and_grad(cost, has_aux=True)(jnp.log(1e-6))
+    assert failed and np.isfinite(value) and np.isfinite(gradient)
+
+
+def test_sign_flip_of_the_estimate_is_flagged_and_undone():
+    """An estimator whose first readings are noise would turn the sign of a; the command never does."""
+    params = wm.params._replace(P0=1e3)
+    log = jaxatt.simulate(wm.loop(substeps=4), params, wm.scenario, uniform(2)[:500], ticks=500)
+    assert log.flipped.any() and np.all(np.asarray(log.J_hat) > 0) and np.asarray(log.J_hat).max() <= 1e3 * (1 + 1e-9)
+    assert np.isfinite(np.asarray(log.r)).all()
+
+
+def test_known_negative_gain_is_no_failure(noise_free):
+    params = wm.mrac_only._replace(a_r=-1.0, a_y=-0.5, law=Adaptation(sign=-1.0))
+    log = jaxatt.simulate(wm.system, params, QUIET._replace(wheel=Wheel(b=-20.0)), SILENCE[:500], ticks=500)
+    np.testing.assert_allclose(log.error, noise_free.error[:500, 0], atol=1e-9)
+
+
+BAD = [
+    (wm.params._replace(J_hat=0.0), wm.scenario, "`params.J_hat` must be a positive number, but it is 0."),
+    (wm.params._replace(P0=-1e-6), wm.scenario, "`params.P0` must be a positive number, but it is -1e-06."),
+    (
+        wm.params._replace(law=Adaptation(gamma=-1e-6)),
+        wm.scenario,
+        "`params.law.gamma` must not be negative, but it is -1e-06.",
+    ),
+    (
+        wm.params._replace(law=Adaptation(sign=0.5)),
+        wm.scenario,
+        "`params.law.sign` must be one of (-1, 1), but it is 0.5.",
+    ),
+    (
+        wm.params._replace(J_most=4.0),
+        wm.scenario,
+        "`params.J_most` must be greater than 5 (params.J_hat), but it is 4.",
+    ),
+    (wm.params._replace(turn=np.nan), wm.scenario, "`params.turn` must be finite, but it is nan."),
+    (wm.params, wm.scenario._replace(J_z=-1.0), "`scenario.J_z` must be a positive number, but it is -1."),
+    (wm.params, wm.scenario._replace(J_w=0.0), "`scenario.J_w` must be a positive number, but it is 0."),
+    (
+        wm.params,
+        wm.scenario._replace(wheel=Wheel(b=0.0)),
+        "`scenario.wheel.b` must not be zero (no command could turn the wheel), but it is 0.",
+    ),
+    (
+        wm.params,
+        wm.scenario._replace(wheel=Wheel(friction=-1.0)),
+        "`scenario.wheel.friction` must not be negative, but it is -1.",
+    ),
+    (
+        wm.params,
+        wm.scenario._replace(wheel=Wheel(weakness=1.5)),
+        "`scenario.wheel.weakness` must be a share of at most 1, but it is 1.5.",
+    ),
+    (wm.params, wm.scenario._replace(delay=0.3), "`scenario.delay` must lie in 0 to 0.2 s, but it is 0.3."),
+    (wm.params, wm.scenario._replace(noise=-0.1), "`scenario.noise` must not be negative, but it is -0.1."),
+]
+
+
+@pytest.mark.parametrize(("params", "scenario", "words"), BAD)
+def test_bad_input_is_refused_in_one_line(params, scenario, words):
+    with pytest.raises(ValueError) as caught:
+        jaxatt.simulate(wm.system, params, scenario, SILENCE[:5], ticks=5)
+    assert str(caught.value) == words
+
+
+def test_bad_loop_and_bad_noise_are_refused():
+    for dt in (0.0, -0.02):
+        with pytest.raises(ValueError, match="`dt` must be a positive number, but it is"):
+            wm.loop(dt=dt)
+    with pytest.raises(ValueError, match="`substeps` must be a whole number of at least 1, but it is 0"):
+        wm.loop(substeps=0)
+    with pytest.raises(ValueError, match=r"`v` must lie between \+-0.05, but it is 0.06 in scenario 1"):
+        wm.normals_of(np.array([0.01, 0.06]), 0.05)
+    assert wm.loop(sampled=True, substeps=10) is wm.loop(substeps=10, sampled=True, dt=0.02) is wm.sampled
+    assert wm.loop() is wm.system
+
+
+def test_adaptation_too_fast_for_the_integration_is_warned_of():
+    """sqrt(b gamma (r^2 + y^2)) = 122 rad/s at the peak with the paper's gamma (spec, 3.5)."""
+    fast = wm.mrac_only._replace(law=Adaptation(gamma=1e-4))
+    with pytest.warns(UserWarning, match=r"gamma` = 0.0001 .* in steps of 0.005 s, is stable only .* up to 6325 deg/s"):
+        jaxatt.simulate(wm.loop(substeps=4), fast, QUIET, SILENCE[:300], ticks=300)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        jaxatt.simulate(wm.loop(substeps=4), wm.mrac_only, QUIET, SILENCE[:300], ticks=300)
+
+
+# sensors
+
+
+def test_sensors():
+    """Supplied noise arrives as given; readings may be late, coarse, or noisy and held between ticks."""
+    v, ticks = portable(300), 300
+    normals = np.random.default_rng(4).normal(size=ticks)
+    noise = wm.normals_of(v, 0.05).at[:, 1].set(normals)
+    days = [wm.scenario, QUIET._replace(delay=0.06), QUIET._replace(tacho_step=64.0), QUIET._replace(tacho_noise=20.0)]
+    log = together([(wm.mrac_only, day) for day in days], noise, wm.loop(substeps=4), ticks)
+    np.testing.assert_allclose((log.error - log.measured)[:, 0], v, atol=1e-15)
+    np.testing.assert_allclose((log.target - log.measured)[3:, 1], log.theta[:-3, 1], atol=1e-12)
+    read = log.residual + log.y_m
+    np.testing.assert_allclose(read[:, 2], 64 * np.round(read[:, 2] / 64), atol=1e-9)
+    np.testing.assert_array_less(np.abs(read - log.y)[:, 2], 32.0001)
+    np.testing.assert_allclose((read - log.y)[:, 3], 20 * normals, atol=1e-9)
+
+
+def test_on_board_code_gets_no_truth():
+    assert list(inspect.signature(wm.decide).parameters) == ["params", "now", "board", "readings"]
+    assert list(inspect.signature(wm.decide_sampled).parameters) == ["params", "now", "board", "readings"]
+
+
+# lanes, gradients, studies
+
+
+def test_lanes_vmap_and_single_runs_agree():
+    rng = np.random.default_rng(5)
+    n, ticks = 3, 150
+    scenarios = batch(wm.scenario, n)._replace(
+        J_z=5 + rng.random(n), noise=0.05 * rng.random(n), delay=0.1 * rng.random(n)
+    )
+    noise = jnp.asarray(rng.normal(size=(ticks, 3, n)))
+    run = lambda s, e: jaxatt.simulate(wm.loop(substeps=4), wm.params, s, e, ticks=ticks)
+    lanes = run(scenarios, noise)
+    mapped = jax.vmap(run, in_axes=(-1, -1), out_axes=-1)(scenarios, noise)
+    single = [run(jax.tree.map(lambda a, i=i: a[i], scenarios), noise[..., i]) for i in range(n)]
+    stacked = jax.tree.map(lambda *a: jnp.stack(a, axis=-1), *single)
+    for other in (mapped, stacked):
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9), lanes, other)
+
+
+def objective(theta, noise, ticks, system):
+    """The spec's cost (spec, 7) over a batch of losses of effectiveness."""
+    log_K, log_gamma, log_P0 = theta
+    params = wm.params._replace(K=jnp.exp(log_K), law=Adaptation(gamma=jnp.exp(log_gamma)), P0=jnp.exp(log_P0))
+    scenarios = batch(wm.scenario, 4)._replace(
+        drive=batch(Fault(onset=4.0), 4)._replace(scale=np.array([1, 0.8, 0.5, 0.2]))
+    )
+    log = jaxatt.simulate(system, params, scenarios, noise, ticks=ticks)
+    return jnp.mean(log.error**2) + 1e-8 * jnp.mean(log.step**2)
+
+
+def test_gradient_is_the_central_difference():
+    """Spec, 8.6."""
+    ticks, system = 500, wm.loop(substeps=8)
+    noise = jnp.broadcast_to(uniform(1, ticks=ticks)[..., None], (ticks, 3, 4))
+    theta = jnp.log(jnp.array([1.0, 1e-6, 1e-6]))
+    both = jax.jit(jax.value_and_grad(lambda theta: objective(theta, noise, ticks, system)))
+    gradient = np.asarray(both(theta)[1])
+    h = 1e-4
+    difference = [(both(theta.at[i].add(h))[0] - both(theta.at[i].add(-h))[0]) / (2 * h) for i in range(3)]
+    np.testing.assert_allclose(gradient, difference, rtol=1e-5)
+    assert np.all(np.abs(gradient) > 0)
+
+
+def test_single_precision_runs():
+    single = lambda tree: jax.tree.map(lambda a: np.float32(a), tree)
+    log = jaxatt.simulate(
+        wm.loop(substeps=8), single(wm.params), single(wm.scenario), uniform(1).astype(jnp.float32), ticks=TICKS
+    )
+    assert log.error.dtype == jnp.float32
+    assert abs(np.abs(log.error).max() - 0.0362) < 2e-3 and abs(float(log.J_hat[-1]) - 5.421) < 2e-3
+
+
+def test_span_of_a_window():
+    parts = [
+        scores.span(jnp.asarray(v), jnp.asarray(inside)) for v, inside in ((3.0, True), (9.0, False), (-1.0, True))
+    ]
+    assert (parts[0] + parts[1] + parts[2]).value() == 4.0
+    assert np.isnan(parts[1].value())
