@@ -61,3 +61,24 @@ def gated(u, gate):
     shut = gate > 0
     s = jnp.clip(10 * jnp.abs(u) / jnp.where(shut, gate, 1) - 9.5, 0, 1)
     return jnp.where(shut, s * s * (3 - 2 * s) * u, u)
+
+
+# rigid body with reaction wheels
+
+
+def wheeled_acceleration(w: Vec3, H: Vec3, T: Vec3, J: Mat3, J_inv: Mat3) -> Vec3:
+    """dw/dt [rad/s^2] of a body whose wheels hold the momentum H and gain it at the rate T, both in body axes.
+
+    J w' = -T - w x (J w + H), Park (2005), eq. (3): the torque on the body is -T. Any consistent units.
+    """
+    return J_inv @ (-T - cross(w, J @ w + H))
+
+
+def wheel_rate(u, h, torque_max, momentum_max):
+    """What the wheels make of the commanded momentum rate u: limited, and none outward past momentum_max.
+
+    u, h: (n, *lanes) commanded rate and momentum; limits of shape (*lanes), inf for none.
+    """
+    limited = jnp.clip(u, -torque_max, torque_max)
+    full = jnp.abs(h) >= momentum_max
+    return jnp.where(full & (limited * h > 0), 0, limited)

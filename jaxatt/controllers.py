@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-from jaxatt.vec import Vec3, norm, safe_sqrt
+from jaxatt.vec import Mat3, Vec3, diagonal, inverse, norm, safe_sqrt
 
 
 def pd(e_q: Vec3, e_w: Vec3, k_q, k_w) -> Vec3:
@@ -103,3 +103,28 @@ def mrac_sampled_bound(law: Adaptation, dt, a_p, b_p, a_y=0.0):
 
 def _projected(a, rate, limit):
     return jnp.where((jnp.abs(a) >= limit) & (a * rate > 0), 0, rate)
+
+
+# PID, and its allocation to wheels
+
+
+def pid(angle: Vec3, integral: Vec3, w: Vec3, k_f: Vec3, k_p: Vec3, k_i: Vec3, k_d: Vec3) -> Vec3:
+    """T = K_F (K_P angle + K_I integral + K_D w) per axis, Park (2005), eq. (5): a momentum rate of the wheels.
+
+    angle [rad], integral [rad s], w [rad/s]; with degrees the published gains are unstable (spec, 1).
+    """
+    law = lambda f, p, i, d, a, s, r: f * (p * a + i * s + d * r)
+    return Vec3(*map(law, k_f, k_p, k_i, k_d, angle, integral, w))
+
+
+def allocation(T: Vec3, axes, up):
+    """Least momentum rates u, shape (n, *lanes), of the wheels that are up, whose sum along their axes is T.
+
+    u = m W' (W m W' + 1e-6 I)^-1 T: the pseudo-inverse to a part in 1e6, and finite with any number of wheels.
+    """
+    o = jnp.zeros_like(T.x)
+    gram = diagonal(Vec3(o, o, o) + Vec3(1e-6, 1e-6, 1e-6))
+    for axis, m in zip(axes, up):
+        gram = gram + Mat3(axis.x * m * axis, axis.y * m * axis, axis.z * m * axis)
+    along = inverse(gram) @ T
+    return jnp.stack([m * (axis @ along) for axis, m in zip(axes, up)])
