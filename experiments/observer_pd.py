@@ -296,7 +296,14 @@ def tuning_score(params, scenario, now, log):
 def tuning_cost(theta, key, scenarios, weight: float):
     """The cost of the gains exp(theta): weight on soft false alarms."""
     s = sweep(op.system, gains(theta), scenarios, key, ticks=600, score=tuning_score)
-    each = weight * s["soft_false"] + s["soft_miss"] + 20 * s["post"] + 10 * s["transient"] + 0.02 * s["rms_u"] + 0.2 * s["rms_u_ill"]
+    each = (
+        weight * s["soft_false"]
+        + s["soft_miss"]
+        + 20 * s["post"]
+        + 10 * s["transient"]
+        + 0.02 * s["rms_u"]
+        + 0.2 * s["rms_u_ill"]
+    )
     return jnp.mean(each)
 
 
@@ -318,7 +325,9 @@ def tuning(report) -> None:
         )
     gain = lambda name: float(after[name].mean() / before[name].mean())
     report.within("tuned / paper's gains, |e_q| after the fault", None, 0.75, gain("post"), f"{n} fresh scenarios")
-    report.within("tuned / paper's gains, rms torque after the fault", None, 0.85, gain("rms_u_ill"), f"{n} fresh scenarios")
+    report.within(
+        "tuned / paper's gains, rms torque after the fault", None, 0.85, gain("rms_u_ill"), f"{n} fresh scenarios"
+    )
     report.within("tuned: false alarms after 10 s", None, 0.001, float(after["false"].mean()), f"{n} fresh scenarios")
     fig, (left, right) = plt.subplots(1, 2, figsize=(9, 3.5), layout="constrained")
     left.plot(history.cost)

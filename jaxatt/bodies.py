@@ -6,7 +6,8 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-from jaxatt.vec import Mat3, Vec3, cross, once
+from jaxatt.mounting import Triads
+from jaxatt.vec import Mat3, Vec3, cross, diagonal, inverse, once
 
 
 def body_acceleration(w: Vec3, u: Vec3, J: Mat3, J_inv: Mat3, sign=-1) -> Vec3:
@@ -82,3 +83,82 @@ def wheel_rate(u, h, torque_max, momentum_max):
     limited = jnp.clip(u, -torque_max, torque_max)
     full = jnp.abs(h) >= momentum_max
     return jnp.where(full & (limited * h > 0), 0, limited)
+
+
+# control-moment-gyro cluster
+
+
+class ModuleInertia(NamedTuple):
+    """Moments of inertia of one module, the same for all of a cluster; shape (*lanes), [kg m^2]."""
+
+    I_cr: Any  # of the whole module about its gimbal axis r
+    I_cs: Any  # of the whole module about its spin axis s
+    I_ct: Any  # of the whole module about its torque axis t
+    I_ws: Any  # of the wheel about its spin axis
+
+
+class CmgMotion(NamedTuple):
+    """Rates of change of a spacecraft with a cluster."""
+
+    w: Vec3  # (*lanes) [rad/s^2]
+    rate: Any  # (n, *lanes) [rad/s^2] of the gimbal rates
+    spin: Any  # (n, *lanes) [rad/s^2] of the wheel speeds
+
+
+def cluster_inertia(J: Mat3, at: Triads, m: ModuleInertia) -> Mat3:
+    """J_T of eq. (11) [kg m^2]: J_S + sum I_cr r r' + I_cs s s' + I_ct t t', using r r' + s s' + t t' = 1."""
+    r, s = each_module(at.r), each_module(at.s)
+    o = len(r) * m.I_ct + jnp.zeros_like(J.x.x)
+    return sum((dyad(a, m.I_cr - m.I_ct) + dyad(b, m.I_cs - m.I_ct) for a, b in zip(r, s)), J + diagonal((o, o, o)))
+
+
+def cluster_momentum(w: Vec3, rate, spin, at: Triads, J_T: Mat3, m: ModuleInertia) -> Vec3:
+    """h_T of eq. (11) [N m s] at gimbal rates and wheel speeds of shape (n, *lanes) [rad/s]."""
+    h = J_T @ w
+    for r, s, a, b in zip(each_module(at.r), each_module(at.s), rate, spin):
+        h += m.I_cr * a * r + m.I_ws * b * s
+    return h
+
+
+def cmg_motion(w: Vec3, rate, spin, at: Triads, J: Mat3, m: ModuleInertia, servo, brake, free, friction) -> CmgMotion:
+    """How a spacecraft with a cluster moves without outer torque, Jin & Leeghim (2021), eqs. (11)-(12), any n.
+
+    w: body rate [rad/s]; rate, spin: gimbal rates and wheel speeds relative to their mounting [rad/s]; J: of the
+    spacecraft without modules [kg m^2]. Module by module, of shape (n, *lanes): servo: gimbal acceleration that
+    the gimbal's drive enforces [rad/s^2]; brake: b_r of the wheel [N m s], 0 where its motor holds the speed;
+    free: 1 where no drive holds the gimbal and it swings against friction [N m s], servo ignored, otherwise 0.
+
+    A free gimbal obeys the balance of momentum about its own axis, in which r.w' couples back to the body; the
+    wheel law leaves out the s.w' part of the wheel's acceleration, as the paper does.
+    """
+    J_T = cluster_inertia(J, at, m)
+    torque = -cross(w, cluster_momentum(w, rate, spin, at, J_T, m))
+    J_w = J_T
+    change, spin_change = [], []
+    for i, (r, s, t) in enumerate(zip(*map(each_module, at))):
+        s_w, t_w = s @ w, t @ w
+        swing = ((m.I_cs - m.I_ct) * s_w * t_w + m.I_ws * spin[i] * t_w - friction[i] * rate[i]) / m.I_cr  # less r.w'
+        change.append(jnp.where(free[i] > 0, swing, servo[i]))
+        spin_change.append(-brake[i] * spin[i] / m.I_ws)
+        torque -= m.I_ws * spin[i] * rate[i] * t  # gyroscopic, eq. (5)
+        torque -= m.I_cr * change[i] * r
+        torque -= (m.I_cs - m.I_ct) * rate[i] * (s_w * t + t_w * s)  # J_T' w
+        torque -= m.I_ws * spin_change[i] * s  # reaction of the brake, in eq. (12) tau_br s_4
+        J_w -= dyad(r, m.I_cr * free[i])
+    w_change = inverse(J_w) @ torque
+    change = [a - free[i] * (r @ w_change) for i, (a, r) in enumerate(zip(change, each_module(at.r)))]
+    return CmgMotion(w_change, jnp.stack(change), jnp.stack(spin_change))
+
+
+def each_module(v: Vec3) -> list[Vec3]:
+    """The vectors, components of shape (*lanes), of a `Vec3` of shape (n, *lanes).
+
+    Sums over modules are written out: over the array's axis they compile to code several times slower.
+    """
+    return [Vec3(*components) for components in zip(*v)]
+
+
+def dyad(v: Vec3, weight) -> Mat3:
+    """weight v v'."""
+    by = weight * v
+    return Mat3(v.x * by, v.y * by, v.z * by)

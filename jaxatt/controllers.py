@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 
+from jaxatt.mounting import GimbalAxes, cmg_triads
+from jaxatt.singularity import gram_determinant, min_norm_solve, robust_solve, times
 from jaxatt.vec import Mat3, Vec3, diagonal, inverse, norm, safe_sqrt
 
 
@@ -128,3 +131,45 @@ def allocation(T: Vec3, axes, up):
         gram = gram + Mat3(axis.x * m * axis, axis.y * m * axis, axis.z * m * axis)
     along = inverse(gram) @ T
     return jnp.stack([m * (axis @ along) for axis, m in zip(axes, up)])
+
+
+# steering of control-moment-gyro clusters
+
+
+class Steering(NamedTuple):
+    """A steering law as numbers: T rate = torque / h_w solved for gimbal rates. Every field has shape (*lanes)."""
+
+    rcond: Any = 1e-15  # [1] singular values below rcond sigma_1 count as zero; used while lam0 is 0
+    lam0: Any = 0.0  # [1] singularity-robust inverse T'(T T' + lam E)^-1, lam = lam0 exp(-mu det T T'); 0: pinv
+    mu: Any = 10.0  # [1] how fast lam falls away from singularity
+    dither: Any = 0.0  # [1] off-diagonal size of E in the generalised singularity-robust inverse
+    dither_rate: Any = jnp.pi / 2  # [rad/s] of the dither
+    null: Any = 0.0  # [1/s] gain of null motion up the gradient of det T T'; no effect with three modules
+
+
+def rate_pi(e: Vec3, integral: Vec3, J_T: Mat3, k_p, k_i) -> Vec3:
+    """PI torque demand J_T (k_p e + k_i integral) [N m] of the rate error e [rad/s], eq. (7)."""
+    return J_T @ (k_p * e + k_i * integral)
+
+
+def steer(law: Steering, a: Vec3, axes: GimbalAxes, gamma, healthy, t):
+    """Gimbal rates [rad/s], shape (n, *lanes), with T rate = a as nearly as the law allows.
+
+    a: wanted change of the cluster's momentum over h_w [1/s]; gamma: gimbal angles [rad], shape (n, *lanes);
+    healthy: 1 or 0, shape (n, *lanes): the columns of T that count; t: time [s], of the dither.
+    """
+
+    def torque(gamma):
+        return healthy * cmg_triads(axes, gamma).t
+
+    T = torque(gamma)
+    up = law.null * jax.grad(lambda gamma: jnp.sum(gram_determinant(torque(gamma))))(gamma)
+    to_do = a - times(T, up)  # so that up moves the gimbals, but not the momentum
+    return up + jnp.where(law.lam0 > 0, robust_solve(T, to_do, damping(law, T, t)), min_norm_solve(T, to_do, law.rcond))
+
+
+def damping(law: Steering, T: Vec3, t) -> Mat3:
+    """lam E of the (generalised) singularity-robust inverse; E = 1 without dither."""
+    lam = law.lam0 * jnp.exp(-law.mu * gram_determinant(T))
+    x, y, z = (law.dither * lam * jnp.sin(law.dither_rate * t + phase) for phase in (0, jnp.pi / 2, jnp.pi))
+    return Mat3(Vec3(lam, z, y), Vec3(z, lam, x), Vec3(y, x, lam))

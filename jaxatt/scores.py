@@ -190,3 +190,42 @@ class Span(NamedTuple):
 def span(value, inside: Any = True) -> Span:
     """Tally how far apart the extremes of value lie over the ticks where ``inside`` holds."""
     return Span(_where(inside, value, -jnp.inf), _where(inside, value, jnp.inf))
+
+
+# sums, and when a peak came
+
+
+class Total(NamedTuple):
+    """Sum over the ticks of a window; 0 if it held none."""
+
+    total: Any = 0.0
+
+    def __add__(self, later):
+        return Total(self.total + later.total)
+
+    def value(self):
+        return self.total
+
+
+class PeakTime(NamedTuple):
+    """Time [s] of the first largest value; NaN if there was no tick."""
+
+    largest: Any = -jnp.inf
+    t: Any = jnp.nan
+
+    def __add__(self, later):
+        higher = later.largest > self.largest
+        return PeakTime(jnp.maximum(self.largest, later.largest), jnp.where(higher, later.t, self.t))
+
+    def value(self):
+        return self.t
+
+
+def total(value, inside=True) -> Total:
+    """Tally a sum over the ticks where ``inside`` holds."""
+    return Total(_where(inside, jnp.asarray(value, jnp.result_type(value, 1.0)), 0))
+
+
+def peak_time(now, value) -> PeakTime:
+    """Tally the time [s] of the largest value."""
+    return PeakTime(value, jnp.broadcast_to(now.t, jnp.shape(value)))

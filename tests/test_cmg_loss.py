@@ -1,0 +1,385 @@
+"""Loss of a control moment gyro: the plant's laws, the paper's cases, faults, steering laws and bad input."""
+
+import inspect
+
+import jax
+
+jax.config.update("jax_enable_x64", True)
+
+from contextlib import suppress  # noqa: E402
+
+import jaxatt  # noqa: E402
+
+with suppress(RuntimeError):  # too late where another test file has run before this one: slower, not wrong
+    jaxatt.fast_cpu()
+
+import jax.numpy as jnp  # noqa: E402
+import numpy as np  # noqa: E402
+import pytest  # noqa: E402
+
+from jaxatt import bodies, simulate, sweep  # noqa: E402
+from jaxatt.attitude import quat_rate, quat_rotate  # noqa: E402
+from jaxatt.bodies import ModuleInertia, cluster_inertia, cluster_momentum  # noqa: E402
+from jaxatt.controllers import Steering, steer  # noqa: E402
+from jaxatt.engine import rk4  # noqa: E402
+from jaxatt.mounting import GimbalAxes, cmg_axes, cmg_triads, modules  # noqa: E402
+from jaxatt.systems import cmg_loss as cmg  # noqa: E402
+from jaxatt.vec import Quat, Vec3, mat3, once, vec3  # noqa: E402
+
+KEY = jax.random.key(0)
+P, B = cmg.PYRAMID, cmg.BOX
+CASES = [  # structure, gamma(0) [deg], class of the paper, class at K_I = 0.02 (spec, 6), |w(0)|
+    (P, (45, 45, 45, 45), 0, 0, 0.0461636114),
+    (P, (10, 55, 45, -10), 0, 0, 0.0266025786),
+    (P, (90, 0, -90, 0), 1, None, 0.0138676583),  # None: rounding decides
+    (P, (90, 0, -90, 5), 0, 0, 0.0139989029),
+    (P, (-90, 90, 90, 95), 2, 2, 0.0350121495),
+    (P, (-95, 90, 85, 95), 0, 2, 0.0350568915),
+    (B, (45, 45, 45, 45), 0, 0, 0.0565628862),
+    (B, (10, 55, 45, -10), 0, 2, 0.0310979751),
+    (B, (90, 0, -90, 5), 2, 2, 0.0017435384),
+    (B, (-90, 90, 90, 95), 2, 2, 0.0399322716),
+    (B, (95, -5, -85, 5), 0, 0, 0.0020916538),
+    (B, (-95, 90, 85, 95), 0, 2, 0.0399870246),
+]
+
+
+def stacked(scenarios):
+    return jax.tree.map(lambda *a: np.stack(np.broadcast_arrays(*a), -1), *scenarios)
+
+
+# the plant
+
+
+J_FULL = mat3(jnp.array([[5.0, 0.4, -0.3], [0.4, 6.0, 0.2], [-0.3, 0.2, 3.0]]))
+INERTIA = ModuleInertia(5e-4, 1e-3, 7e-4, 1e-3)  # I_cs, I_ct and I_cr all different
+AXES = cmg_axes(np.radians(P), np.radians([0.0, 90.0, 180.0, 270.0]))
+LAST, HEALTHY = np.array([0.0, 0, 0, 1]), np.array([1.0, 1, 1, 0])
+
+
+def free_flow(motion, t, x, brake=1e-3, free=0.0):
+    """Rate of change of x = (attitude, w, gamma, rates, spins) while the gimbals swing, and the motors' power."""
+    q, w, gamma, rate, spin = x
+    at = cmg_triads(AXES, gamma)
+    servo = (HEALTHY * jnp.sin(2 * t + jnp.arange(4.0)) - rate) / 0.05
+    m = motion(w, rate, spin, at, J_FULL, INERTIA, servo, brake * LAST, free * np.ones(4), np.zeros(4))
+    power = jnp.sum(INERTIA.I_ws * spin * (rate * (at.t @ w) + at.s @ m.w))  # of the motors that hold the wheels
+    return (quat_rate(q, w), m.w, rate, m.rate, m.spin), power
+
+
+def inertial_momentum(x):
+    q, w, gamma, rate, spin = x
+    at = cmg_triads(AXES, gamma)
+    return quat_rotate(q, cluster_momentum(w, rate, spin, at, cluster_inertia(J_FULL, at, INERTIA), INERTIA))
+
+
+def kinetic_energy(x):
+    _, w, gamma, rate, spin = x
+    at, m = cmg_triads(AXES, gamma), INERTIA
+    along = m.I_ws * spin * (at.s @ w) + m.I_cr * rate * (at.r @ w)
+    own = 0.5 * m.I_ws * spin**2 + 0.5 * m.I_cr * rate**2
+    return 0.5 * w @ (cluster_inertia(J_FULL, at, m) @ w) + jnp.sum(along + own)
+
+
+def some_state(seed=0, spin=600.0):
+    rng = np.random.default_rng(seed)
+    q = rng.normal(size=4)
+    rates = jnp.asarray(rng.normal(size=4)) * (HEALTHY if spin else 1)
+    q = Quat(*(q / np.linalg.norm(q)))
+    return q, Vec3(0.3, -0.4, 0.25), jnp.asarray(rng.normal(size=4)), rates, spin * jnp.ones(4)
+
+
+def momentum_leak(motion, x, **kind):
+    """|dH/dt| / |H| of the inertial momentum along the flow [1/s]: zero to rounding where it is conserved."""
+    H, leak = jax.jvp(inertial_momentum, (x,), (free_flow(motion, 0.7, x, **kind)[0],))
+    return np.linalg.norm(np.stack(leak)) / np.linalg.norm(np.stack(H))
+
+
+MISTAKES = {
+    "sign of the brake reaction": ("torque -= m.I_ws * spin_change[i] * s", "torque += m.I_ws * spin_change[i] * s"),
+    "brake reaction dropped": ("torque -= m.I_ws * spin_change[i] * s", "pass"),
+    "failed wheel dropped from w x h_T": ("(w, rate, spin, at", "(w, rate, jnp.where(brake > 0, 0, spin), at"),
+    "gimbal acceleration dropped": ("torque -= m.I_cr * change[i] * r", "pass"),
+    "J_T' dropped": ("torque -= (m.I_cs - m.I_ct) * rate[i] * (s_w * t + t_w * s)", "pass"),
+    "gimbal momentum dropped from w x h_T": ("(w, rate, spin, at", "(w, 0 * rate, spin, at"),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_conservation_catches_a_wrong_term(mistake):
+    right, wrong = MISTAKES[mistake]
+    source = inspect.getsource(bodies.cmg_motion)
+    assert source.count(right) == 1
+    scope = dict(vars(bodies))
+    exec(source.replace(right, wrong), scope)
+    assert momentum_leak(bodies.cmg_motion, some_state()) < 1e-14
+    assert momentum_leak(scope["cmg_motion"], some_state()) > 1e-6
+
+
+def test_momentum_is_conserved():
+    h = 2e-3
+    o = jnp.zeros(())
+    gamma = jnp.radians(jnp.array([10.0, 55.0, 45.0, -10.0]))
+    start = Quat(o + 1, o, o, o), vec3(jnp.array([0.05, -0.1, 0.08])), gamma, jnp.zeros(4), 600 * jnp.ones(4)
+    flow = lambda t, x: once(lambda t, x: free_flow(bodies.cmg_motion, t, x)[0], t, x)
+    run = jax.jit(lambda x: jax.lax.scan(lambda x, k: (rk4(flow, k * h, x, h), None), x, jnp.arange(5000))[0])
+    end = run(start)
+    H, H0 = (np.stack(inertial_momentum(x)) for x in (end, start))
+    assert np.linalg.norm(H - H0) < 1e-9 and np.linalg.norm(H0) > 0.5
+    np.testing.assert_allclose(end[4], 600 * np.array([1, 1, 1, np.exp(-10)]), rtol=1e-9)  # I_ws / b_r = 1 s
+
+
+@pytest.mark.parametrize("spin", [0.0, 60.0])
+def test_free_gimbals_conserve_momentum_and_energy(spin):
+    """Wheels at rest relative to the body, and held at speed by motors whose work is counted."""
+    for seed in range(3):
+        x = some_state(seed, spin)
+        assert momentum_leak(bodies.cmg_motion, x, brake=0.0, free=1.0) < 1e-13
+        rate, power = free_flow(bodies.cmg_motion, 0.7, x, brake=0.0, free=1.0)
+        energy, gain = jax.jvp(kinetic_energy, (x,), (rate,))
+        assert abs(gain - power) < 1e-13 * energy
+        assert (np.abs(rate[3]) > 1e-3).all()
+
+
+def test_motion_is_equation_12_for_three_modules():
+    """A plain NumPy transcript of the printed equations, J_T and all, against a run of the system."""
+    sb, cb = np.sin(np.radians(P)), np.cos(np.radians(P))
+    Js, Icr, Ics, Ict, Iws, br, tau = np.diag([50.0, 50, 30]), 5e-4, 1e-3, 5e-4, 1e-3, 1e-6, 0.05
+    R = np.array([[sb, 0, -sb, 0], [0, sb, 0, -sb], [cb] * 4])
+
+    def ST(g):
+        s, c = np.sin(g), np.cos(g)
+        S = [[-s[0] * cb, -c[1], s[2] * cb, c[3]], [c[0], -s[1] * cb, -c[2], s[3] * cb], list(s * sb)]
+        T = [[-c[0] * cb, s[1], c[2] * cb, -s[3]], [-s[0], -c[1] * cb, s[2], c[3] * cb], list(c * sb)]
+        return np.array(S), np.array(T)
+
+    def J_T(S, T):
+        return Js + Icr * R @ R.T + Ics * S @ S.T + Ict * T @ T.T
+
+    def rates(x, u):
+        w, g, gd, Om = x[:3], x[3:7], x[7:11], x[11]
+        S, T = ST(g)
+        J = J_T(S, T)
+        gdd = np.append((u - gd[:3]) / tau, 0)
+        h = J @ w + 0.6 * S[:, :3].sum(1) + Icr * R[:, :3] @ gd[:3] + Iws * Om * S[:, 3]
+        inner = br * Om * S[:, 3] - Icr * R @ gdd
+        for i in range(3):
+            inner -= (Ics - Ict) * gd[i] * (T[:, i] * (S[:, i] @ w) + S[:, i] * (T[:, i] @ w))
+        wd = np.linalg.solve(J, -np.cross(w, h) - 0.6 * T[:, :3] @ gd[:3] + inner)
+        return np.concatenate([wd, gd, gdd, [-br * Om / Iws]])
+
+    g = np.radians([45.0] * 4)
+    S, T = ST(g)
+    x = np.concatenate([-np.linalg.solve(J_T(S, T), 0.6 * S.sum(1)), g, np.zeros(4), [600.0]])
+    integral, trace = 0, []
+    for _ in range(50):
+        S, T = ST(x[3:7])
+        integral = integral - 0.1 * x[:3]
+        a = -J_T(S, T) @ (-0.2 * x[:3] + 0.02 * integral) / 0.6
+        u = np.clip(np.linalg.solve(T[:, :3], a), -1, 1)
+        trace.append(x)
+        for _ in range(100):
+            k1 = rates(x, u)
+            k2 = rates(x + 5e-4 * k1, u)
+            k3 = rates(x + 5e-4 * k2, u)
+            x = x + 1e-3 / 6 * (k1 + 2 * k2 + 2 * k3 + rates(x + 1e-3 * k3, u))
+    log = simulate(cmg.system, cmg.params, cmg.scenario, KEY, ticks=1000, every=10)
+    trace = np.array(trace)
+    np.testing.assert_allclose(np.stack(log.w, -1)[:50], trace[:, :3], atol=1e-11)
+    np.testing.assert_allclose(log.gamma[:50], trace[:, 3:7], atol=1e-9)
+    np.testing.assert_allclose(log.spin[:50, 3], trace[:, 11], rtol=1e-12)
+
+
+# the paper's cases
+
+
+def swept(params, scenarios):
+    return sweep(cmg.system, params, stacked(scenarios), KEY, ticks=6001, score=cmg.score, progress=False)
+
+
+@pytest.fixture(scope="module")
+def paper():
+    return [cmg.lost(skew, gamma) for skew, gamma, *_ in CASES]
+
+
+@pytest.fixture(scope="module")
+def cases(paper):
+    return swept(cmg.params, paper), swept(cmg.table5, paper)
+
+
+def test_start(cases):
+    for run in cases:
+        np.testing.assert_allclose(run.start, [case[4] for case in CASES], atol=1e-10)
+        assert run.ok.all() and run.absorbable.all() and (run.momentum < 1e-7).all()
+
+
+def test_classes_of_table_5(cases):
+    printed, table5 = map(cmg.classify, cases)
+    assert table5.tolist() == [case[2] for case in CASES]
+    assert [c for c, case in zip(printed, CASES) if case[3] is not None] == [
+        case[3] for case in CASES if case[3] is not None
+    ]
+
+
+def test_settling_and_residual_rate(cases):
+    printed, table5 = cases
+    assert printed.settling[0] == pytest.approx(30.4, abs=0.1)
+    assert table5.settling[0] == pytest.approx(14.6, abs=0.1)
+    # K_I = 0 leaves the rate at which K_P J gives way to the brake, wherever the brake's axis lies
+    proper = cmg.classify(table5) == cmg.PROPER
+    assert (np.abs(table5.final[proper] - 5.7e-5) < 4e-5).all()
+
+
+@pytest.mark.parametrize("params, peak, at", [(cmg.params, 52.18, 4.7), (cmg.table5, 31.56, 6.3)])
+def test_condition_of_figure_7(params, peak, at):
+    log = simulate(cmg.system, params, cmg.scenario, KEY, ticks=1000, every=10)  # at the control samples
+    assert log.condition[0] == pytest.approx(2.0004, abs=1e-4)
+    assert np.max(log.condition) == pytest.approx(peak, abs=0.05)
+    assert 0.1 * np.argmax(log.condition) == pytest.approx(at, abs=0.1)
+
+
+# faults, seams, batches
+
+
+def test_failures_of_table_1():
+    start = (P, (45, 45, 45, 45))
+    several = [
+        cmg.lost(*start, onset=1.0, brake=1e-3),
+        cmg.lost(*start, module=1, onset=1.0, brake=0.0)._replace(std_w=1e-4),
+        cmg.lost(*start, onset=1.0, brake=0.0, free=1.0, friction=1e-3),
+    ]
+    keys = jax.random.split(KEY, 3)
+    log = simulate(cmg.system, cmg.params, stacked(several), keys, ticks=300)
+    before, after = log.gamma[101] - log.gamma[100], log.gamma[299] - log.gamma[200]
+    assert (np.abs(before[0]) > 0).all()
+    assert np.abs(after[3, 0]) < 1e-9 and np.abs(after[1, 1]) < 1e-9 and np.abs(after[3, 2]) > 0.01
+    assert log.spin[299, 3, 0] == pytest.approx(600 * np.exp(-1.99), rel=1e-6)
+    assert (log.spin[:, :, 1:] == 600).all()
+    assert max(np.ptp(np.asarray(c), axis=0).max() for c in log.momentum) < 1e-9
+    assert (log.u[100:, 3, 0] == 0).all() and (np.abs(log.u[:100, 3, 0]) > 0).any()
+    alone = simulate(cmg.system, cmg.params, several[1], keys[1], ticks=300)
+    for a, b in zip(jax.tree.leaves(alone), jax.tree.leaves(log)):
+        np.testing.assert_allclose(b[..., 1], a, rtol=1e-6, atol=1e-9)
+
+
+def test_what_is_wrong_is_flagged_and_leaves_the_others_alone(paper, cases):
+    calm = paper[0]
+    broken = calm._replace(spin=np.array([600.0, 1e200, 600.0, 600.0]))  # overflows
+    too_much = calm._replace(h=Vec3(2.0, 0.0, 0.0))
+    got = swept(cmg.table5, [broken, too_much, cmg.lost(B, (0, 0, 0, 0)), *paper])
+    assert got.ok.tolist() == [False] + 14 * [True]
+    assert got.absorbable[:4].tolist() == [True, False, True, True]
+    assert got.rank_one[:4].tolist() == [0, 0, 1, 0]
+    assert cmg.classify(got)[0] == cmg.FLUCTUATION  # NaN is never proper
+    for a, b in zip(jax.tree.leaves(cases[1]), jax.tree.leaves(got)):
+        np.testing.assert_array_equal(a, b[..., 3:])
+
+
+def test_six_modules_with_three_lost():
+    axes = cmg_axes(np.radians(60.0), np.arange(6) * np.pi / 3)
+    failure = cmg.Failure(*(np.where(np.arange(6) < 3, a, b) for a, b in ((0.0, np.inf), (1e-6, 0), (0, 0), (0, 0))))
+    gamma = np.radians([30.0, 50, 70, 20, 10, -40])
+    six = cmg.Scenario(gamma, failure, axes, rate=np.zeros(6), spin=np.full(6, 600.0))
+    cmg.refuse_bad(cmg.params, six)
+    x, z = cmg.init(cmg.params, six)
+    x = x._replace(rate=jnp.linspace(-1.0, 1.0, 6))
+    z = z._replace(drive=cmg.Drive(jnp.linspace(0.5, -0.5, 6), failure.brake, failure.free))
+
+    def momentum(x):
+        at = cmg_triads(axes, x.gamma)
+        J_T = cluster_inertia(six.J, at, six.module)
+        return quat_rotate(x.q, cluster_momentum(x.w, x.rate, x.spin, at, J_T, six.module))
+
+    _, leak = jax.jvp(momentum, (x,), (cmg.flow(cmg.params, six, 0.0, x, z),))
+    assert np.linalg.norm(np.stack(leak)) < 1e-14
+    T = np.stack([np.asarray(c) for c in cmg_triads(axes, gamma).t])
+    for healthy in (np.ones(6), np.array([0.0, 1, 1, 0, 1, 1])):
+        u = steer(Steering(), Vec3(0.1, -0.2, 0.05), axes, jnp.asarray(gamma), healthy, 0.0)
+        np.testing.assert_allclose(u, np.linalg.pinv(T * healthy) @ [0.1, -0.2, 0.05], rtol=1e-9, atol=1e-12)
+
+
+def test_steering_laws():
+    axes = cmg_axes(np.radians(P), np.radians([0.0, 90.0, 180.0, 270.0]))
+    gamma, a, ones = jnp.array([0.3, -0.4, 1.1, 2.0]), Vec3(0.1, -0.2, 0.05), jnp.ones(4)
+    T = np.stack([np.asarray(c) for c in cmg_triads(axes, gamma).t])
+    pinv = steer(Steering(), a, axes, gamma, ones, 0.0)
+    np.testing.assert_allclose(pinv, np.linalg.pinv(T) @ np.array(a), rtol=1e-10)
+    moved = steer(Steering(null=0.5), a, axes, gamma, ones, 0.0)
+    assert np.abs(moved - pinv).max() > 1e-3
+    np.testing.assert_allclose(T @ moved, np.array(a), atol=1e-12)  # null motion gives no torque
+    measure = lambda g: np.linalg.det((T_ := np.stack([np.asarray(c) for c in cmg_triads(axes, g).t])) @ T_.T)
+    assert measure(gamma + 1e-3 * (moved - pinv)) > measure(gamma)
+    three = steer(Steering(null=0.5), a, axes, gamma, jnp.array([1.0, 1, 1, 0]), 0.0)
+    np.testing.assert_allclose(three, np.append(np.linalg.solve(T[:, :3], np.array(a)), 0), atol=1e-10)
+
+    lam = 0.01 * np.exp(-10 * np.linalg.det(T @ T.T))
+    for dither, t in ((0.0, 0.0), (0.1, 0.7)):
+        e1, e2, e3 = dither * np.sin(np.pi / 2 * t + np.array([0, np.pi / 2, np.pi]))
+        E = np.array([[1, e3, e2], [e3, 1, e1], [e2, e1, 1]])
+        robust = steer(Steering(lam0=0.01, dither=dither), a, axes, gamma, ones, t)
+        np.testing.assert_allclose(robust, T.T @ np.linalg.solve(T @ T.T + lam * E, np.array(a)), rtol=1e-9)
+
+
+def test_robust_inverse_ends_the_chatter(paper):
+    """With lam0 = 0.01 and K_I = 0 none of the spec's hard cases fluctuates; dither frees the pyramid's lock."""
+    robust, dithered = (
+        cmg.classify(swept(cmg.table5._replace(steering=law), paper))
+        for law in (Steering(lam0=0.01), Steering(lam0=0.01, dither=0.1))
+    )
+    assert (robust != cmg.FLUCTUATION).all()
+    assert robust[2] == cmg.LOCK and robust[8] == cmg.LOCK  # pyramid [90, 0, -90, 0], box [90, 0, -90, 5]
+    assert dithered[2] == cmg.PROPER and dithered[8] == cmg.LOCK
+
+
+def test_gradients():
+    noise = jnp.zeros((20, 3))
+
+    def cost(theta):
+        k_p, k_i, lam0, turn = theta
+        p = cmg.Params(k_p=k_p, k_i=k_i, steering=Steering(lam0=lam0, dither=0.1))
+        s = cmg.scenario._replace(gamma=cmg.scenario.gamma + turn * jnp.array([1.0, -1.0, 1.0, 0.0]))
+        log = simulate(cmg.system._replace(substeps=1), p, s, noise, ticks=20)
+        return jnp.sum(log.w @ log.w) + 1e-3 * jnp.sum(log.acceleration)
+
+    theta = jnp.array([0.2, 0.02, 0.01, 0.03])
+    along = jax.jit(lambda theta, d: jax.jvp(cost, (theta,), (d,)))  # reverse mode compiles several times longer
+    for d in np.eye(4):
+        numeric = (along(theta + 1e-5 * d, d)[0] - along(theta - 1e-5 * d, d)[0]) / 2e-5
+        assert along(theta, d)[1] == pytest.approx(float(numeric), rel=1e-5)
+
+
+def test_steering_has_finite_gradients_at_singularities():
+    for gamma in ([90.0, 0, -90, 0], [-90, 90, 90, 95], [0, 0, 0, 0]):
+        for skew in (P, B):
+            axes, a = cmg.lost(skew, gamma).axes, Vec3(0.1, -0.2, 0.05)
+            u = lambda g, axes=axes, a=a: jnp.sum(steer(Steering(), a, axes, g, np.array([1.0, 1, 1, 0]), 0.0))
+            assert np.isfinite(jax.grad(u)(jnp.radians(jnp.asarray(gamma, float)))).all()
+
+
+def test_bad_input_is_refused_in_one_line():
+    s, run = cmg.scenario, lambda p, s: simulate(cmg.system, p, s, KEY, ticks=1)
+    onset = s.failure._replace(onset=np.array([0.0, np.inf, np.inf, 0.0]))
+    flat = cmg_axes(0.0, np.arange(4.0))
+    long = GimbalAxes(Vec3(*(1.1 * c for c in s.axes.r)), s.axes.s0)
+    few = cmg.Scenario(
+        np.zeros(2),
+        cmg.Failure(*np.zeros((4, 2)))._replace(onset=np.full(2, np.inf)),
+        modules(s.axes, [0, 1]),
+        rate=np.zeros(2),
+        spin=np.ones(2),
+    )
+    bad = [
+        (cmg.params._replace(k_p=-1.0), s, "params.k_p"),
+        (cmg.params._replace(steering=Steering(lam0=-1.0)), s, "params.steering.lam0"),
+        (cmg.params, s._replace(failure=onset), "healthy modules of scenario.axes"),
+        (cmg.params, few, "healthy modules of scenario.axes"),
+        (cmg.params, s._replace(axes=flat), "parallel"),
+        (cmg.params, s._replace(axes=long), "unit vectors"),
+        (cmg.params, s._replace(gamma=np.array([0.0, np.nan, 0.0, 0.0])), "scenario.gamma"),
+        (cmg.params, s._replace(tau_g=0.0), "scenario.tau_g"),
+        (cmg.params, s._replace(failure=s.failure._replace(free=np.full(4, 0.5))), "scenario.failure.free"),
+    ]
+    for p, scenario, words in bad:
+        with pytest.raises(ValueError, match=words) as error:
+            run(p, scenario)
+        assert "\n" not in str(error.value)
