@@ -162,3 +162,11 @@ def dyad(v: Vec3, weight) -> Mat3:
     """weight v v'."""
     by = weight * v
     return Mat3(v.x * by, v.y * by, v.z * by)
+
+
+# rigid body on a circular orbit
+
+
+def gravity_gradient(down: Vec3, J: Mat3, orbit_rate) -> Vec3:
+    """Gravity-gradient torque 3 wo^2 z x J z [N m]; down: nadir z in body axes, a unit vector; orbit_rate [rad/s]."""
+    return 3 * orbit_rate * orbit_rate * cross(down, J @ down)

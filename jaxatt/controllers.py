@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from jaxatt.mounting import GimbalAxes, cmg_triads
 from jaxatt.singularity import gram_determinant, min_norm_solve, robust_solve, times
-from jaxatt.vec import Mat3, Vec3, diagonal, inverse, norm, safe_sqrt
+from jaxatt.vec import Mat3, Quat, Vec3, cross, diagonal, inverse, norm, safe_sqrt
 
 
 def pd(e_q: Vec3, e_w: Vec3, k_q, k_w) -> Vec3:
@@ -173,3 +173,16 @@ def damping(law: Steering, T: Vec3, t) -> Mat3:
     lam = law.lam0 * jnp.exp(-law.mu * gram_determinant(T))
     x, y, z = (law.dither * lam * jnp.sin(law.dither_rate * t + phase) for phase in (0, jnp.pi / 2, jnp.pi))
     return Mat3(Vec3(lam, z, y), Vec3(z, lam, x), Vec3(y, x, lam))
+
+
+# quaternion PD
+
+
+def quaternion_pd(e: Quat, e_w: Vec3, w: Vec3, J: Mat3, bandwidth, damping) -> Vec3:
+    """Torque [N m] u = -J (2 wn^2 sign(e_0) e_v + 2 zeta wn e_w) + w x J w: a linear second-order closed loop.
+
+    e: error quaternion; e_w: rate error [rad/s]; w: body rate [rad/s]; J [kg m^2]; bandwidth wn [rad/s]; damping
+    zeta [1]. The sign takes the shorter way round.
+    """
+    shorter = jnp.where(e.w < 0, -1, 1)
+    return cross(w, J @ w) - J @ ((2 * bandwidth**2 * shorter) * e.v + (2 * damping * bandwidth) * e_w)

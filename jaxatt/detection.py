@@ -1,8 +1,180 @@
-"""Fault detection: from residuals to alarms, from alarms to the channel at fault."""
+"""Detection: from residuals to alarms, from alarms to a cause, and how good a detector is.
+
+Time leads, lanes trail. An evaluation is any number that is large when something is wrong; here mostly
+J = r' M^-1 r, chi-square with as many degrees of freedom as the residual has where the filter is consistent.
+"""
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
+import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.scipy.special import gammaincc
+
+from jaxatt import check
+
+NONE, FIRST, SECOND, COMMON = 0, 1, 2, 3  # causes that two residual generators can tell apart
+CAUSES = ("none", "first sensor", "second sensor", "common to both")
+
+# windows and thresholds
+
+
+def windowed(evaluation, n: int):
+    """Sum of the last n values at every time, Yuan et al., eq. (18); fewer where fewer were seen. Shape (T, *lanes).
+
+    Raises ValueError for n < 1.
+    """
+    n = check.whole("n", n)
+    a = jnp.asarray(evaluation)
+    ones = (1,) * (a.ndim - 1)
+    pad = ((n - 1, 0),) + ((0, 0),) * (a.ndim - 1)
+    return jax.lax.reduce_window(a, 0.0, jax.lax.add, (n, *ones), (1,) * a.ndim, pad)
+
+
+def threshold_nsigma(n, dof):
+    """n^2 dof: every component of the residual n standard deviations off at once. dof = 3 N for N values of J."""
+    return n * n * dof
+
+
+def threshold_moment(n, dof):
+    """dof + n sqrt(2 dof): the mean of a chi-square number and n of its standard deviations."""
+    return dof + n * jnp.sqrt(2.0 * dof)
+
+
+def threshold_mean(n, dof):
+    """n dof: n times the mean of a chi-square number."""
+    return n * dof
+
+
+def threshold_quantile(false_alarm, dof):
+    """The value that a chi-square number of dof degrees of freedom exceeds with probability false_alarm.
+
+    By bisection on the survival function. Raises ValueError for a probability outside (0, 1) or dof <= 0.
+    """
+    check.between("false_alarm", false_alarm, 0, 1, "a probability")
+    check.positive("dof", dof)
+    target, dof = jnp.broadcast_arrays(jnp.asarray(false_alarm, float), jnp.asarray(dof, float))
+    high = dof + 40 * jnp.sqrt(2 * dof) + 1500  # survival below 1e-300
+
+    def halve(_, interval):
+        low, high = interval
+        middle = (low + high) / 2
+        beyond = gammaincc(dof / 2, middle / 2) > target
+        return jnp.where(beyond, middle, low), jnp.where(beyond, high, middle)
+
+    low, high = jax.lax.fori_loop(0, 100, halve, (jnp.zeros_like(high), high))
+    return (low + high) / 2
+
+
+# alarms and causes
+
+
+def alarm(evaluation, threshold):
+    """Whether the evaluation exceeds its threshold; NaN alarms."""
+    return ~(evaluation <= threshold)
+
+
+def isolate(first, second):
+    """The cause that the alarms of two residual generators point to, eq. (20): one of `NONE` ... `COMMON`.
+
+    One alarm blames its own sensor; both blame what the two share, the gyro (not in the paper).
+    """
+    return jnp.where(first & second, COMMON, jnp.where(first, FIRST, jnp.where(second, SECOND, NONE)))
+
+
+def isolate_first(first, second, patience):
+    """The cause from the times [s] of first alarm, inf for never, when the verdict waits patience [s] for the other."""
+    seen = jnp.minimum(first, second)
+    return isolate(jnp.isfinite(first) & (first <= seen + patience), jnp.isfinite(second) & (second <= seen + patience))
+
+
+# how good a detector is
+
+
+class Roc(NamedTuple):
+    """False-alarm and detection rates over falling thresholds; every field has shape (thresholds,)."""
+
+    threshold: Any  # [evaluation unit]
+    false_alarm: Any  # [1] share of healthy values above it
+    detection: Any  # [1] share of faulty values above it
+
+
+def roc(healthy, faulty, thresholds=None) -> Roc:
+    """The ROC curve of values of an evaluation with and without fault, each flattened.
+
+    thresholds: where to take it; None takes every value that occurs. A run that alarms at least once in a window is
+    described by its largest value there.
+    """
+    healthy, faulty = np.sort(np.ravel(healthy)), np.sort(np.ravel(faulty))
+    if thresholds is None:
+        thresholds = np.unique(np.concatenate([healthy, faulty, [-np.inf]]))
+    at = np.sort(np.asarray(thresholds, float))[::-1]
+    above = lambda values: 1 - np.searchsorted(values, at, side="right") / len(values)
+    return Roc(at, above(healthy), above(faulty))
+
+
+def detection_at(healthy, faulty, false_alarm) -> float:
+    """The detection rate at the lowest threshold whose false-alarm rate does not exceed false_alarm."""
+    healthy = np.sort(np.ravel(healthy))
+    allowed = int(np.floor(false_alarm * len(healthy) + 1e-9))
+    threshold = healthy[len(healthy) - 1 - allowed] if allowed < len(healthy) else -np.inf
+    return float(np.mean(np.ravel(faulty) > threshold))
+
+
+def area(curve: Roc) -> float:
+    """Area under a ROC curve: the probability that a faulty value exceeds a healthy one."""
+    x = np.concatenate([[0], curve.false_alarm, [1]])
+    y = np.concatenate([[0], curve.detection, [1]])
+    return float(np.sum(np.diff(x) * (y[1:] + y[:-1]) / 2))
+
+
+def first_alarm(alarms, t, since=0.0):
+    """Time [s] from since to the first alarm not before it, inf if never: shape (*lanes) from alarms (T, *lanes)."""
+    t = jnp.asarray(t).reshape(-1, *(1,) * (jnp.ndim(alarms) - 1))
+    return jnp.min(jnp.where(alarms & (t >= since), t - since, jnp.inf), axis=0)
+
+
+def detected_by(delays, times):
+    """Share of runs detected within each of the times [s]: the distribution of the delay; never is inf."""
+    delays = np.sort(np.ravel(delays))
+    return np.searchsorted(delays, np.asarray(times), side="right") / len(delays)
+
+
+def chance(false_alarm, samples):
+    """Probability of at least one alarm in so many independent healthy samples: what a detection is worth against."""
+    return -jnp.expm1(samples * jnp.log1p(-jnp.asarray(false_alarm, float)))
+
+
+def confusion(truth, verdict, causes: int = len(CAUSES)):
+    """Counts, shape (causes, causes): row what was wrong, column what was blamed."""
+    table = np.zeros((causes, causes), int)
+    np.add.at(table, (np.ravel(truth).astype(int), np.ravel(verdict).astype(int)), 1)
+    return table
+
+
+# smooth surrogates, for gradients in thresholds, windows and gains
+
+
+def soft_windowed(evaluation, n, longest: int):
+    """`windowed` with a window of real length n in [1, longest]: its oldest value counts in part. Shape (T, *lanes)."""
+    a = jnp.asarray(evaluation)
+    weights = jnp.clip(n - jnp.arange(longest), 0, 1)
+    padded = jnp.concatenate([jnp.zeros((longest - 1, *a.shape[1:]), a.dtype), a])
+    return sum(weights[i] * padded[longest - 1 - i : longest - 1 - i + len(a)] for i in range(longest))
+
+
+def soft_alarm(evaluation, threshold, temperature):
+    """A probability of alarm in place of a step at the threshold; the step is its limit for temperature -> 0."""
+    return jax.nn.sigmoid((evaluation - threshold) / temperature)
+
+
+def soft_delay(probability, dt):
+    """Expected time [s] to the first alarm, sum_k prod_{j<k} (1 - p_j) dt; at most T dt. Shape (*lanes)."""
+    silent = jnp.cumprod(1 - probability, axis=0)
+    return dt * (1 + jnp.sum(silent[:-1], axis=0))
+
 
 # chi-square of the innovation, channel by channel
 

@@ -1,0 +1,339 @@
+"""The loop `star_isolation`: its filters against plain matrices, the spec's numbers, gradients and the door."""
+
+import jax
+
+jax.config.update("jax_enable_x64", True)
+
+import warnings  # noqa: E402
+from functools import partial  # noqa: E402
+
+import jax.numpy as jnp  # noqa: E402
+import numpy as np  # noqa: E402
+import pytest  # noqa: E402
+
+import jaxatt  # noqa: E402
+from jaxatt import Fault, Quat, Vec3, detection, estimators, scores  # noqa: E402
+from jaxatt.systems import star_isolation as star  # noqa: E402
+from jaxatt.systems.star_isolation import ARCSEC, DEG, HEALTHY, PITCH, ROLL, params, scenario  # noqa: E402
+
+KEY = jax.random.key(1)
+TICKS = 3000
+DT = star.DT
+SIZE = 100 * ARCSEC
+healthy = scenario._replace(star=HEALTHY)
+
+
+def with_fault(sensor, fault):
+    return scenario._replace(star=star.on_sensor(sensor, star.tangential(sensor, fault)))
+
+
+@jax.jit
+def _run(one):
+    log = jaxatt.simulate(star.system, params, one, KEY, ticks=TICKS)
+    return log.board, log.readings, log.q
+
+
+@pytest.fixture(scope="module")
+def run():
+    """Runs of the default loop with one seed, kept: (board, readings, q) by scenario."""
+    kept = {}
+
+    def of(one=healthy):
+        name = str(jax.tree.leaves(one))
+        if name not in kept:
+            kept[name] = jax.tree.map(np.asarray, _run(jax.tree.map(lambda a: jnp.asarray(a, float), one)))
+        return kept[name]
+
+    return of
+
+
+# the filter in plain matrices
+
+
+def left(p):
+    w, x, y, z = p
+    return np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
+
+
+def right(q):
+    w, x, y, z = q
+    return np.array([[w, -x, -y, -z], [x, w, z, -y], [y, -z, w, x], [z, y, -x, w]])
+
+
+def skew(v):
+    x, y, z = v
+    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+
+
+def plain_filter(s, gyro, readings):
+    """Eqs. (11) to (16) as matrices: residuals, their covariances, gains, A and C; reading 0 is not used."""
+    sg, ss, wo = params.std_gyro, params.std_star, params.orbit_rate
+    B = [-DT / 2 * right(np.r_[0, e]) for e in np.eye(3)]
+    C = np.column_stack([s, 2 * skew(s)])
+    x, P = np.array([1.0, 0, 0, 0]), np.diag([1e-12, 1e-6, 1e-6, 1e-6])
+    Q = P + np.outer(x, x)
+    r, M, K, A = [], [], [], []
+    for w, y in zip(gyro[:-1], readings[1:]):
+        a = np.eye(4) + DT / 2 * (right(np.r_[0, w]) - left([0, 0, -wo, 0]))
+        noise = sum(sg**2 * b @ Q @ b.T for b in B)
+        P, Q = a @ P @ a.T + noise, a @ Q @ a.T + noise
+        m = C @ P @ C.T + ss**2 * np.eye(3)
+        k = P @ C.T @ np.linalg.inv(m)
+        r.append(y - C @ a @ x)
+        x, P = a @ x + k @ r[-1], P - k @ m @ k.T
+        M.append(m), K.append(k), A.append(a)
+    return np.array(r), np.array(M), np.array(K), np.array(A), C
+
+
+def rows(v):
+    """A Vec3 of (T, ...) as (T, ..., 3)."""
+    return np.stack([np.asarray(a) for a in v], axis=-1)
+
+
+@pytest.mark.parametrize("own", [ROLL, PITCH])
+def test_the_filter_is_that_of_plain_matrices(run, own):
+    board, readings, _ = run()
+    r, M, *_ = plain_filter(np.eye(3)[own], rows(readings.gyro), rows(readings.stars)[:, own])
+    np.testing.assert_allclose(rows(board.innovation.r)[1:, own], r, atol=1e-14)
+    nis = np.einsum("ti,tij,tj->t", r, np.linalg.inv(M), r)
+    np.testing.assert_allclose(board.innovation.nis[1:, own], nis, atol=1e-9)
+    np.testing.assert_allclose(board.innovation.log_det[1:, own], np.linalg.slogdet(M)[1], atol=1e-10)
+
+
+def test_multiplicative_noise_has_the_closed_form():
+    Q = np.cov(np.random.default_rng(0).standard_normal((4, 9)))
+    B = [-DT / 2 * right(np.r_[0, e]) for e in np.eye(3)]
+    plain = sum(0.3**2 * b @ Q @ b.T for b in B)
+    np.testing.assert_allclose(np.array(estimators.rate_noise(Q, 0.3, DT)), plain, atol=1e-15)
+
+
+@pytest.mark.parametrize("own", [ROLL, PITCH])
+def test_a_fault_answers_as_the_linear_error_equations_say(run, own):
+    fault = Fault(onset=100.0, bias=SIZE)
+    (ill, _, _), (well, readings, _) = run(with_fault(own, fault)), run()
+    difference = rows(ill.innovation.r)[1:, own] - rows(well.innovation.r)[1:, own]
+    _, _, K, A, C = plain_filter(np.eye(3)[own], rows(readings.gyro), rows(readings.stars)[:, own])
+    f = SIZE * (1 - np.eye(3)[own])
+    x, response = np.zeros(4), []
+    for k in range(TICKS - 1):
+        response.append(C @ A[k] @ x + f * (k >= 999))  # eq. (14) with A(k-1)
+        x = A[k] @ x - K[k] @ response[-1]  # eq. (16)
+    np.testing.assert_allclose(difference, response, atol=1e-12 * SIZE / ARCSEC / 100)
+
+
+def test_the_steady_state_satisfies_17(run):
+    _, readings, _ = run()
+    *_, K, _, C = plain_filter(np.eye(3)[ROLL], rows(readings.gyro), rows(readings.stars)[:, ROLL])
+    K, f = K[-1], SIZE * np.array([0.0, 1, 1])
+    w = [0, 0, -params.orbit_rate, 0]
+    A = np.eye(4) + DT / 2 * (right(w) - left(w))
+    F = (np.eye(4) - K @ C) @ A
+    assert np.abs(np.linalg.eigvals(F)).max() < 1 and np.abs(np.linalg.eigvals(A)).max() > 1 - 1e-12  # erratum 2
+    x = -np.linalg.solve(np.eye(4) - F, K @ f)
+    assert np.abs((np.eye(4) - A) @ x + K @ (C @ A @ x + f)).max() < 1e-12  # eq. (17)
+    settled = np.zeros(4)
+    for _ in range(200_000):
+        settled = F @ settled - K @ f
+    np.testing.assert_allclose(settled, x, atol=1e-12)
+
+
+# the spec's numbers
+
+
+def test_time_constants(run):
+    expected = {(ROLL, 1): 12.28, (ROLL, 2): 16.15, (PITCH, 0): 16.03, (PITCH, 2): 16.25}
+    t = DT * np.arange(101)
+    for (own, axis), seconds in expected.items():
+        ill = rows(run(with_fault(own, Fault(onset=100.0, bias=SIZE)))[0].innovation.r)
+        r = (ill - rows(run()[0].innovation.r))[1000:1101, own, axis] / SIZE
+        assert r[0] == pytest.approx(1, abs=1e-12)
+        assert -1 / np.polyfit(t, np.log(r), 1)[0] == pytest.approx(seconds, rel=0.02)
+
+
+@pytest.mark.parametrize("tau, z, y", [(10.0, 0.4602, 0.4126), (50.0, 0.1890, 0.1549), (200.0, 0.0650, 0.0492)])
+def test_peaks_of_incipient_faults(run, tau, z, y):
+    ill = rows(run(with_fault(ROLL, Fault(onset=100.0, drift=SIZE, tau=tau)))[0].innovation.r)
+    r = (ill - rows(run()[0].innovation.r))[:, ROLL].max(axis=0) / SIZE
+    assert r[2] == pytest.approx(z, rel=0.02) and r[1] == pytest.approx(y, rel=0.02)
+
+
+@pytest.mark.parametrize("own", [ROLL, PITCH])
+@pytest.mark.parametrize("fault", [Fault(onset=100.0, bias=SIZE), Fault(onset=100.0, drift=6 * SIZE, tau=50.0)])
+def test_figures_2_to_5(run, own, fault):
+    board, _, _ = run(with_fault(own, fault))
+    assert board.alarm[1000:, own].any() and not board.alarm[:, 1 - own].any()
+    assert board.latched_cause[-1] == own + 1
+    if fault.bias:
+        assert board.alarm[1000, own] and not board.alarm[999, own]
+    if own == ROLL and fault.bias:
+        assert not board.alarm[-1, own] and board.latched[-1, own]  # the alarm ends by itself: latch
+
+
+def test_an_actuator_fault_raises_no_alarm(run):
+    bad = Vec3(Fault(onset=100.0, bias=0.01), Fault(), Fault(onset=100.0, scale=0.5))
+    board, _, q = run(healthy._replace(actuator=bad))
+    assert not board.alarm.any()
+    assert 2 * np.abs(np.asarray(q.x[-1])) > 2e-3  # while it does move the satellite
+
+
+def test_a_gyro_fault_raises_both_alarms_and_no_angle_alarm(run):
+    board, _, _ = run(healthy._replace(gyro=Vec3(*[Fault(onset=100.0, bias=3e-5)] * 3)))
+    assert board.latched_cause[-1] == 3 and not board.angle_alarm.any()
+
+
+def test_a_star_fault_towards_the_other_star_opens_the_angle(run):
+    axis = Vec3(Fault(), Fault(onset=100.0, bias=SIZE), Fault())
+    board, _, _ = run(scenario._replace(star=star.on_sensor(ROLL, axis)))
+    assert board.angle_alarm[1000:].mean() > 0.9 and not board.angle_alarm[:1000].any()
+
+
+def swept(one, n, p=params):
+    """Scores of n runs whose initial estimates err as the prior says."""
+    many = spread(one, n)
+    errors = params.std_qv * np.random.default_rng(0).standard_normal((3, 2, n))
+    guess = Quat(np.broadcast_to(many.q.w, (2, n)), *(np.broadcast_to(a, (2, n)) + e for a, e in zip(many.q.v, errors)))
+    many = many._replace(q_hat=guess)
+    return jaxatt.sweep(star.system, p, many, jax.random.key(5), ticks=TICKS, score=both, progress=False)
+
+
+def both(p, s, now, log):
+    return star.score(p, s, now, log), scores.mean(log.board.innovation.nis, now.t >= 100)
+
+
+def test_monte_carlo_is_consistent():
+    n = 600
+    out, _ = swept(healthy, n, params._replace(threshold=10.35))
+    np.testing.assert_allclose(out.nis.mean(axis=1), 3, atol=0.01)
+    np.testing.assert_allclose(out.nees.mean(axis=1), 3, atol=1.96 * np.sqrt(6 / n))
+    assert out.false_alarms.mean() == pytest.approx(1.58e-2, rel=0.05)
+    assert out.ok.all()
+
+
+def test_unit_vectors_leave_two_degrees_of_freedom():
+    out, _ = swept(healthy, 600, params._replace(unit=1.0))
+    np.testing.assert_allclose(out.nis.mean(axis=1), 2, atol=0.01)
+
+
+@pytest.mark.parametrize("degrees, nis", [(1.0, 3.73), (2.0, 14.7)])
+@pytest.mark.filterwarnings("ignore:.*deg from the orbit frame")
+def test_pointing_off_raises_the_residual(degrees, nis):
+    q = Quat(np.cos(degrees * DEG / 2), *[np.sin(degrees * DEG / 2) / np.sqrt(3)] * 3)
+    w = star.seen(q, star.orbit_rate(scenario.orbit_rate))
+    out, _ = swept(healthy._replace(q=q, w=Vec3(*(float(a) for a in w))), 128, params._replace(q_d=q))
+    assert out.nis[ROLL].mean() == pytest.approx(nis, rel=0.05)
+
+
+def test_a_gyro_bias_raises_both_residuals():
+    bias = DEG / 3600 / np.sqrt(3)
+    _, settled = swept(healthy._replace(bias=Vec3(bias, bias, bias)), 128)
+    np.testing.assert_allclose(settled.mean(axis=1), [3.9, 4.8], rtol=0.05)
+
+
+def spread(one, n):
+    return jax.tree.map(lambda a: np.broadcast_to(np.asarray(a, float)[..., None], (*np.shape(a), n)), one)
+
+
+# the other filters
+
+
+@partial(jax.jit, static_argnums=0)
+def _replayed(number, q_hat, readings):
+    return star.replay((star.LMMSE, star.WITH_BIAS, star.TURN)[number], params, q_hat, readings)
+
+
+def test_replay_is_the_run(run):
+    board, readings, _ = run()
+    again = _replayed(0, healthy.q_hat, readings)
+    np.testing.assert_allclose(again.nis, board.innovation.nis[1:], atol=1e-11)
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_the_other_filters_are_consistent(run, number):
+    _, readings, _ = run()
+    nis = np.asarray(_replayed(number, healthy.q_hat, readings).nis)
+    np.testing.assert_allclose(nis.mean(axis=0), 3, atol=4 * np.sqrt(6 / TICKS))
+
+
+def test_seven_states_without_a_bias_are_the_four(run):
+    _, readings, _ = run()
+    tiny = params._replace(std_bias=1e-14)
+    seven = jax.jit(lambda r: star.replay(star.WITH_BIAS, tiny, healthy.q_hat, r))(readings)
+    four = _replayed(0, healthy.q_hat, readings)
+    # not equal: seven states weigh the gyro's noise at P + x x', four at the second moment's own recursion
+    np.testing.assert_allclose(rows(seven.r), rows(four.r), atol=1e-3 * params.std_star)
+
+
+# structure
+
+
+def test_a_window_on_board_is_that_of_detection():
+    log = jaxatt.simulate(
+        star.system_of(window=10), params, with_fault(PITCH, Fault(onset=2.0, bias=SIZE)), KEY, ticks=40
+    )
+    np.testing.assert_allclose(log.board.J, detection.windowed(log.board.innovation.nis, 10), rtol=1e-12)
+
+
+# gradients
+
+
+def test_the_likelihood_has_the_gradient_of_central_differences(run):
+    readings = jax.tree.map(lambda a: a[:400], run()[1])
+
+    @jax.jit
+    def cost(theta):
+        p = params._replace(std_gyro=3e-6 * jnp.exp(theta[0]), std_star=params.std_star * jnp.exp(theta[1]))
+        of = star.replay(star.LMMSE, p, healthy.q_hat, readings)
+        return 0.5 * jnp.mean(of.log_det + of.nis)
+
+    at = jnp.array([0.3, -0.2])
+    reverse, forward = jax.jit(jax.grad(cost))(at), jax.jit(jax.jacfwd(cost))(at)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-9)
+    for i, h in enumerate(1e-3 * jnp.eye(2)):
+        near, far = cost(at + h) - cost(at - h), cost(at + 2 * h) - cost(at - 2 * h)
+        assert reverse[i] == pytest.approx(float(8 * near - far) / (12 * 1e-3), rel=1e-6)
+
+
+# the door
+
+
+def simulate(p=params, s=scenario):
+    return jaxatt.simulate(star.system, p, s, KEY, ticks=2)
+
+
+@pytest.mark.parametrize(
+    "p, s, words",
+    [
+        ({}, {"q": Quat(1.0, 0.1, 0.0, 0.0)}, "`|scenario.q|` must be 1, but it is 1.00499"),
+        ({"q_d": Quat(2.0, 0.0, 0.0, 0.0)}, {}, "`|params.q_d|` must be 1, but it is 2"),
+        ({"stars": Vec3(np.ones(2), np.zeros(2), np.zeros(2))}, {}, "`params.stars` must lie in directions at least"),
+        ({"stars": Vec3(np.ones(2), np.ones(2), np.zeros(2))}, {}, "`|params.stars|` must be 1, but it is 1.41421"),
+        ({"std_gyro": -1e-6}, {}, "`params.std_gyro` must be a positive number, but it is -1e-06"),
+        ({"std_star": 0.0}, {}, "`params.std_star` must be a positive number, but it is 0"),
+        ({}, {"std_star": -1.0}, "`scenario.std_star` must not be negative, but it is -1"),
+        ({"law": 4.0}, {}, "`params.law` must be one of"),
+        ({"feedback": 5.0}, {}, "`params.feedback` must be one of"),
+        ({}, {"gyro": jaxatt.on_axes(Fault(tau=0.0))}, "`scenario.gyro.x.tau` must be a positive number"),
+    ],
+)
+def test_bad_input_is_refused_by_name(p, s, words):
+    with pytest.raises(ValueError) as refused:
+        simulate(params._replace(**p), scenario._replace(**s))
+    assert words in str(refused.value)
+
+
+@pytest.mark.parametrize("dt", [0.0, -0.1, np.nan])
+def test_a_step_must_be_positive(dt):
+    with pytest.raises(ValueError, match="`dt` must be a positive number"):
+        star.system_of(dt=dt)
+    with pytest.raises(ValueError, match="`window` must be a whole number"):
+        star.system_of(window=0)
+
+
+def test_pointing_beyond_the_linear_range_warns_with_the_number():
+    off = Quat(np.cos(0.6 * DEG), np.sin(0.6 * DEG), 0.0, 0.0)
+    with pytest.warns(UserWarning, match=r"`scenario.q` lies 1.2 deg from the orbit frame, beyond the 0.5 deg"):
+        star.system.check(params, scenario._replace(q=off))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        star.system.check(params, scenario)
+        star.system_of(star.TURN).check(params, scenario._replace(q=off))
