@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from jax.flatten_util import ravel_pytree
 from tqdm.auto import tqdm
 
 from jaxatt import check
@@ -129,6 +130,27 @@ def rerun(system: System, params, scenarios, key, index: int, *, ticks: int):
     return compiled(block_log, 2)(system, ticks, params, here, raw_key(key), np.int32(block), np.int32(lane))
 
 
+FEW = 6  # numbers up to which forward mode is the cheaper
+
+
+def value_and_gradient(cost: Callable, theta, key):
+    """cost(theta, key), a scalar, and its gradient, a tree like theta.
+
+    Up to `FEW` numbers by forward mode: it costs less than reverse mode there, compiles in a quarter of the time
+    and keeps no history. Pure.
+
+    Raises TypeError if the cost is no scalar.
+    """
+    flat, unravel = ravel_pytree(theta)
+    if jax.eval_shape(cost, theta, key).shape != ():
+        raise TypeError(f"`cost` must be a scalar, but its shape is {jax.eval_shape(cost, theta, key).shape}.")
+    if flat.size > FEW:
+        return jax.value_and_grad(cost)(theta, key)
+    along = lambda direction: jax.jvp(lambda a: cost(unravel(a), key), (flat,), (direction,))
+    value, slopes = jax.vmap(along, out_axes=(None, 0))(jnp.eye(flat.size, dtype=flat.dtype))
+    return value, unravel(slopes)
+
+
 class History(NamedTuple):
     """What `tune` met, step by step; every leaf leads with the steps."""
 
@@ -152,7 +174,7 @@ def tune(cost: Callable, theta, optimizer, steps: int, key, *, progress: bool | 
     theta = jax.tree.map(lambda a: jnp.asarray(a, jnp.result_type(a, float)), theta)
 
     def step(theta, state, factor):
-        value, gradient = jax.value_and_grad(cost)(theta, key)
+        value, gradient = value_and_gradient(cost, theta, key)
         size = optax.global_norm(gradient)
         more = dict(value=value, grad=gradient, value_fn=lambda theta: cost(theta, key)) if line_search else {}
         updates, state = optimizer.update(gradient, state, theta, **more)

@@ -10,7 +10,7 @@ import optax
 import pytest
 
 from jaxatt import scores
-from jaxatt.study import rerun, sweep, tune
+from jaxatt.study import FEW, rerun, sweep, tune, value_and_gradient
 from jaxatt.systems import observer_pd as op
 
 ROOT = Path(__file__).parents[1]
@@ -142,6 +142,17 @@ def test_tune_finds_the_minimum_and_records_the_way():
     assert history.cost.shape == (200,) and history.theta["b"].shape == (200, 2)
     assert history.cost[-1] < history.cost[0] and (history.step == 1).all()
     assert history.gradient[0] == pytest.approx(np.sqrt(36 + 8))
+
+
+def test_forward_and_reverse_mode_agree_and_a_cost_must_be_a_scalar():
+    quartic = lambda theta, key: jnp.sum(jnp.sin(theta) ** 4) + theta[0] * theta[-1]
+    for n in (2, FEW, FEW + 1):
+        theta = jnp.linspace(0.1, 2.0, n)
+        value, gradient = value_and_gradient(quartic, theta, KEY)
+        assert value == pytest.approx(float(quartic(theta, KEY)))
+        np.testing.assert_allclose(gradient, jax.grad(quartic)(theta, KEY), rtol=1e-12)
+    with pytest.raises(TypeError, match=r"`cost` must be a scalar, but its shape is \(2,\)"):
+        tune(lambda theta, key: theta, np.ones(2), optax.sgd(0.1), 2, KEY)
 
 
 def test_tune_takes_any_optax_optimizer():
