@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import sys
+import time
 from pathlib import Path
 
 import jax
@@ -29,8 +30,10 @@ def main() -> int:
 
     report = Report(args.out, args.quick)
     for name in args.names or NAMES:
+        started = time.perf_counter()
         report.start(name)
         importlib.import_module(f"experiments.{name}").run(report)
+        report.note(f"{name} took {time.perf_counter() - started:.0f} s")
     return 0 if report.write() else 1
 
 

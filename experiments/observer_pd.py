@@ -158,7 +158,7 @@ def figures(report) -> None:
     ax.axhline(op.params.sigma, color="C1", linestyle="--", label=r"threshold $\sigma$ = 0.01")
     marked(ax, r"$|\xi|$ [MRP, rad/s]")
     ax.set_ylim(3e-4, 0.5)
-    ax.legend(loc="center left")
+    ax.legend(loc="upper left")
     report.figure("fig1_residual", fig)
     for name, error, ylabel in (
         ("fig2_attitude_error", log.e_q, "attitude error [MRP]"),
