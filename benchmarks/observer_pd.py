@@ -25,7 +25,7 @@ from jaxatt.engine import compiled
 from jaxatt.study import value_and_gradient
 from jaxatt.systems.observer_pd import START_UP, Params, Scenario, Scores, params, scenario, score, system
 
-TICKS = 400
+TICKS = 1000
 FORMS = {"shipped": system, "one-step": system._replace(substeps=1, dt=system.dt / system.substeps)}
 
 

@@ -118,9 +118,9 @@ def whole(name: str, value, least: int = 1) -> int:
 
 
 def _dtype(trees):
-    """The floating type of a run: what the floating leaves promote to."""
-    floating = [leaf for leaf in jax.tree.leaves(trees) if jnp.issubdtype(jnp.result_type(leaf), jnp.floating)]
-    return jnp.result_type(*floating, 1.0)
+    """The floating type of a run: what the floating leaves promote to; Python numbers follow the others."""
+    kinds = {leaf.dtype for leaf in jax.tree.leaves(trees) if hasattr(leaf, "dtype")}
+    return jnp.result_type(1.0, *(kind for kind in kinds if jnp.issubdtype(kind, jnp.floating)))
 
 
 def converted(params, scenario) -> tuple[Any, Any]:
@@ -132,10 +132,10 @@ def converted(params, scenario) -> tuple[Any, Any]:
     dtype = _dtype((_numbers("params", params), _numbers("scenario", scenario)))
 
     def convert(leaf):
-        keep = isinstance(leaf, (np.ndarray, np.generic, jax.Array)) and not jnp.issubdtype(leaf.dtype, jnp.floating)
-        if isinstance(leaf, (bool, np.bool_)):
-            return jnp.asarray(leaf, bool)
-        return jnp.asarray(leaf, leaf.dtype if keep else dtype)
+        kind = getattr(leaf, "dtype", bool if isinstance(leaf, bool) else dtype)
+        wanted = dtype if jnp.issubdtype(kind, jnp.floating) else kind
+        # NumPy where it will do: a hundred transfers to the device would take longer than a short sweep
+        return jnp.asarray(leaf, wanted) if isinstance(leaf, jax.Array) else np.asarray(leaf, wanted)
 
     return jax.tree.map(convert, params), jax.tree.map(convert, scenario)
 

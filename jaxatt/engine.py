@@ -177,11 +177,11 @@ def _polynomial(coefficients, w):
     return value
 
 
-def _normal(bits, dtype):
-    """Standard normal numbers of random 32-bit words, by the inverse distribution; drawn in float32 and cast."""
+def _normal(bits):
+    """Standard normal numbers of random 32-bit words, float32, by the inverse distribution."""
     u = ((bits >> 9).astype(jnp.float32) + 0.5) * 2.0**-23  # symmetric, never 0 or 1
     w = -jnp.log(4 * u * (1 - u))
-    return ((2 * u - 1) * _polynomial(_P, w) / _polynomial(_Q, w)).astype(dtype)
+    return (2 * u - 1) * _polynomial(_P, w) / _polynomial(_Q, w)
 
 
 def _words(key, shape):
@@ -196,7 +196,7 @@ def _chunk_noise(system: System, key, k0, ticks: int, lanes: tuple, dtype):
         return jnp.zeros((ticks, *shape), dtype)
     keys = jax.vmap(lambda k: jax.random.key_data(jax.random.fold_in(jax.random.wrap_key_data(key), k)))
     bits = once(lambda k0: jax.vmap(lambda key: _words(key, shape))(keys(k0 + jnp.arange(ticks))), k0)
-    return once(lambda bits: _normal(bits, dtype), bits)
+    return once(_normal, bits).astype(dtype)  # cast outside: within, float64 would halve the width of all of it
 
 
 def raw_key(key):
