@@ -31,15 +31,15 @@ def seconds(run: Callable[[], object]) -> float:
     return time.perf_counter() - start
 
 
-def c_library(source: Path, real: str) -> ctypes.CDLL:
-    """Compile a C file with gcc for this machine, ``-DREAL=float`` or ``double``, and load it.
+def c_library(source: Path, real: str, *more: str) -> ctypes.CDLL:
+    """Compile a C file with gcc for this machine, ``-DREAL=float`` or ``double``, and load it; more: further flags.
 
     Raises RuntimeError with the compiler's words where that fails.
     """
     target = Path(tempfile.mkdtemp()) / f"{source.stem}_{real}.so"
     fast = ["-O3", "-march=native", "-mprefer-vector-width=512", "-ffast-math", "-fno-finite-math-only"]
     flags = [*fast, "-shared", "-fPIC"]  # infinities and NaN keep their meaning
-    command = ["gcc", *flags, f"-DREAL={real}", str(source), "-o", str(target), "-lm"]
+    command = ["gcc", *flags, *more, f"-DREAL={real}", str(source), "-o", str(target), "-lm"]
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode:
         raise RuntimeError(f"`gcc` must compile {source.name}, but it says: {done.stderr.strip()}")

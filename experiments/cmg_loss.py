@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import jax
 import matplotlib.pyplot as plt
 import numpy as np
@@ -258,15 +256,20 @@ def ties(report: Report) -> None:
         ("box-90", (-90, 90, 90), 95, 11.43005230, 2),
     ]  # fmt: skip
     for name, start, gamma_4, kappa, number in starts:
-        rank = partial(by_simulation, name, gamma_4, cmg.table5)
+        ranks = {}
+
+        def rank(gamma, name=name, gamma_4=gamma_4, ranks=ranks):
+            values = by_simulation(name, gamma_4, cmg.table5, gamma)
+            ranks.update(zip(map(tuple, gamma), values))
+            return values
+
         found = sg.rearrange(THREE[name], np.radians(start), rank=rank)
         head = f"rearranged {name} {list(start)}"
         report.relative(f"{head}: condition", kappa, found.condition[0], 1e-8, f"{SPEC}, 5")
         report.check(f"{head}: number of ties", number, len(found.gamma), 0, f"{SPEC}, 5")
-        for gamma, variation in zip(found.gamma, rank(found.gamma)):
-            report.note(
-                f"    {np.degrees(gamma).round().astype(int).tolist()}: variation {variation:.4g} rad/s at K_I = 0"
-            )
+        for gamma in found.gamma:
+            degrees, variation = np.degrees(gamma).round().astype(int).tolist(), ranks[tuple(gamma)]
+            report.note(f"    {degrees}: variation {variation:.4g} rad/s at K_I = 0")
         ends = sg.rearrange_by_gradient(THREE[name], np.radians(start))
         report.within(f"{head}: condition by gradient", 1, kappa * (1 + 1e-6), ends.condition, f"{SPEC}, 9")
 
