@@ -19,7 +19,7 @@ from jaxatt.attitude import mrp_matrix, mrp_rate, mrp_rate_transposed
 from jaxatt.bodies import body_acceleration
 from jaxatt.engine import rk4
 from jaxatt.estimators import AttitudeRate, mrp_observer
-from jaxatt.study import value_and_gradient
+from jaxatt.study import batch, value_and_gradient
 from jaxatt.systems import observer_pd as op
 from jaxatt.vec import array, cross, inverse, norm, vec3
 
@@ -39,11 +39,6 @@ def run(report) -> None:
     monte_carlo(report)
     fault_sizes(report)
     tuning(report)
-
-
-def repeated(scenario, n: int):
-    """n copies of a scenario in the last axis."""
-    return jax.tree.map(lambda a: np.full(n, a), scenario)
 
 
 def mathematics(report) -> None:
@@ -152,7 +147,7 @@ def marked(ax, ylabel: str) -> None:
 
 def figures(report) -> None:
     """Figures 1-3 of the paper, one run."""
-    log = rerun(op.system, op.params, repeated(op.scenario, 1), KEY, 0, ticks=3500)
+    log = rerun(op.system, op.params, batch(op.scenario, 1), KEY, 0, ticks=3500)
     t = op.DT * np.arange(3500)
     fig, ax = plt.subplots(figsize=(7, 3.5))
     ax.semilogy(t, log.xi, linewidth=0.6, label=r"residual norm $|\xi|$")
@@ -200,7 +195,7 @@ def monte_carlo(report) -> None:
     for eps, rows in table.items():
         system = op.system._replace(substeps=4 if eps == 0.1 else 8)
         params = op.params._replace(eps=eps)
-        swept = sweep(system, params, repeated(op.scenario, n), KEY, ticks=3500, score=windows)
+        swept = sweep(system, params, batch(op.scenario, n), KEY, ticks=3500, score=windows)
         for span, (xi, share, q, w), got in zip(("60-150", "150-250", "250-350"), rows, swept):
             rms = [float(np.sqrt(a.mean())) for a in (got[0], got[2], got[3])]
             name = f"eps {eps}, {span} s: rms |xi|, |e_q|, |e_w|"
@@ -218,11 +213,9 @@ def fault_sizes(report) -> None:
     column = lambda sensor, kind: np.array([s if (a, b) == (sensor, kind) else 0.0 for a, b, s in cases])[case]
     n = len(case)
     onset = np.random.default_rng(3).uniform(30, 40, n)
-    scenarios = repeated(QUIET._replace(std_q=op.STD_Q, std_w=op.STD_W), n)
+    scenarios = batch(QUIET._replace(std_q=op.STD_Q, std_w=op.STD_W), n)
     fault = lambda sensor: on_axes(
-        jax.tree.map(lambda a: np.full(n, a), Fault())._replace(
-            onset=onset, random=column(sensor, "random"), bias=column(sensor, "bias")
-        )
+        batch(Fault(), n)._replace(onset=onset, random=column(sensor, "random"), bias=column(sensor, "bias"))
     )
     scenarios = scenarios._replace(star=fault("star"), gyro=fault("gyro"))
     swept = sweep(op.system, op.params, scenarios, jax.random.fold_in(KEY, 1), ticks=700, score=op.score)
@@ -268,9 +261,9 @@ def fault_sizes(report) -> None:
 def tuning_scenarios(n: int, seed: int):
     """Slews of 60 s with a gyro bias at 20 s, a random star-sensor fault at 40 s, a wrong start of the observer."""
     rng = np.random.default_rng(seed)
-    scenarios = repeated(op.scenario, n)
+    scenarios = batch(op.scenario, n)
     shaken = lambda v: Vec3(*(a + 0.05 * rng.normal(size=n) for a in v))
-    faults = lambda f: jax.tree.map(lambda a: np.full(n, a), on_axes(f))
+    faults = lambda f: batch(on_axes(f), n)
     return scenarios._replace(
         q_hat=shaken(scenarios.q), w_hat=shaken(scenarios.w),
         gyro=faults(Fault(20.0, bias=0.02)), star=faults(Fault(40.0, random=0.01)),

@@ -117,7 +117,7 @@ def whole(name: str, value, least: int = 1) -> int:
     return int(value)
 
 
-def _dtype(trees):
+def float_type(trees):
     """The floating type of a run: what the floating leaves promote to; Python numbers follow the others."""
     kinds = {leaf.dtype for leaf in jax.tree.leaves(trees) if hasattr(leaf, "dtype")}
     return jnp.result_type(1.0, *(kind for kind in kinds if jnp.issubdtype(kind, jnp.floating)))
@@ -129,7 +129,7 @@ def converted(params, scenario) -> tuple[Any, Any]:
     Python numbers become floats; integer and bool arrays stay what they are. Raises TypeError for a leaf that
     is no number.
     """
-    dtype = _dtype((_numbers("params", params), _numbers("scenario", scenario)))
+    dtype = float_type((_numbers("params", params), _numbers("scenario", scenario)))
 
     def convert(leaf):
         kind = getattr(leaf, "dtype", bool if isinstance(leaf, bool) else dtype)
@@ -147,13 +147,6 @@ def _numbers(name: str, tree):
         ):
             raise TypeError(f"`{name}{jax.tree_util.keystr(path)}` must be a number or an array, but it is {leaf!r}.")
     return tree
-
-
-def same_structure(name: str, tree, example) -> None:
-    """Refuse a tree whose structure is not that of the example."""
-    got, want = jax.tree.structure(tree), jax.tree.structure(example)
-    if got != want:
-        raise ValueError(f"`{name}` must have the structure {want}, but it is {got}.")
 
 
 def lanes(scenarios) -> int:

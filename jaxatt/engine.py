@@ -1,4 +1,4 @@
-"""The loop: what a closed loop is, how one is run. Knows no spacecraft; imports only check and scores.
+"""The loop: what a closed loop is, how one is run. Knows no spacecraft; imports only check, scores and vec.
 
 Time runs in ticks of ``dt``. A tick happens at its instant: sensors read, on-board code decides, a log is
 written. Between ticks the continuous state flows, by RK4. Scenarios lie in lanes, the last axis of everything.
@@ -80,9 +80,7 @@ def _like(tree, example, what: str):
 
     def fit(a, b):
         if not jnp.can_cast(jnp.result_type(a), b.dtype, "same_kind"):
-            raise TypeError(
-                f"`{what}` must return {b.dtype} where the state is {b.dtype}, but it is {jnp.result_type(a)}."
-            )
+            raise TypeError(f"`{what}` must return the state's type {b.dtype}, but it is {jnp.result_type(a)}.")
         if jnp.broadcast_shapes(jnp.shape(a), b.shape) != b.shape:
             raise TypeError(f"`{what}` must return shape {b.shape} where the state has it, but it is {jnp.shape(a)}.")
         return jnp.broadcast_to(jnp.asarray(a, b.dtype), b.shape)
@@ -90,17 +88,12 @@ def _like(tree, example, what: str):
     return jax.tree.map(fit, tree, example)
 
 
-def _dtype(params, scenario):
-    floating = [a.dtype for a in jax.tree.leaves((params, scenario)) if jnp.issubdtype(a.dtype, jnp.floating)]
-    return jnp.result_type(*floating) if floating else jnp.result_type(1.0)
-
-
 def _start(system: System, params, scenario, lanes: int):
     """x, z at tick 0, in the floating type of the run, every leaf with its lanes."""
     init = partial(system.init, params)
     for _ in range(lanes):
         init = jax.vmap(init, in_axes=-1, out_axes=-1)
-    dtype = _dtype(params, scenario)
+    dtype = check.float_type((params, scenario))
 
     def strong(a):
         a = jnp.asarray(a)
@@ -111,7 +104,7 @@ def _start(system: System, params, scenario, lanes: int):
 
 def _step(system: System, params, scenario, k, state, noise):
     """One tick and the flow to the next."""
-    dtype = _dtype(params, scenario)
+    dtype = check.float_type((params, scenario))
     now = Now(k, k.astype(dtype) * system.dt, system.dt)
     x, z, log = system.tick(params, scenario, now, *state, noise)
     x, z = _like((x, z), state, "tick")
@@ -258,7 +251,7 @@ def simulate(system: System, params, scenario, noise_or_key, *, ticks: int, ever
 
 def _simulate(system, ticks, every, keyed, params, scenario, source):
     chunk = CHUNK if every == 1 else every
-    dtype = _dtype(params, scenario)
+    dtype = check.float_type((params, scenario))
     lanes = source.shape[:-1] if keyed else source.shape[2:]
     if keyed:
 
@@ -294,7 +287,7 @@ def block_scores(system: System, score: Callable, ticks: int, params, scenarios,
 
     key: raw key of the sweep; block: number of the block, which with the key fixes its noise.
     """
-    dtype = _dtype(params, scenarios)
+    dtype = check.float_type((params, scenarios))
     key = _block_key(key, block)
     noise = partial(_block_noise, system, key, dtype)
 
@@ -322,7 +315,7 @@ def _block_noise(system, key, dtype, c):
 
 def block_log(system: System, ticks: int, params, scenarios, key, block, lane):
     """The log, time first, of one lane of a block: the same computation as `block_scores`."""
-    noise = partial(_block_noise, system, _block_key(key, block), _dtype(params, scenarios))
+    noise = partial(_block_noise, system, _block_key(key, block), check.float_type((params, scenarios)))
 
     def fold(none, now, log):
         return none, jax.tree.map(lambda a: jnp.broadcast_to(a, _lane_shape(jnp.shape(a)))[..., lane], log)
