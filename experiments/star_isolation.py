@@ -17,7 +17,7 @@ import numpy as np
 import optax
 
 from experiments.report import Report, interval, plt
-from jaxatt import Fault, Quat, Vec3, detection, scores, simulate, sweep, tune
+from jaxatt import Fault, Quat, Vec3, detection, plot, scores, simulate, sweep, tune
 from jaxatt.estimators import lmmse_predict, lmmse_start, lmmse_update
 from jaxatt.systems.star_isolation import (
     ARCSEC,
@@ -318,7 +318,8 @@ def detection_table(report: Report) -> None:
 
     fig, (ax, ax_delay) = plt.subplots(1, 2, figsize=(11, 4.4))
     reference = {1: 0.28, 5: 0.80, 10: 0.955, 50: 1.0}
-    colours = dict(zip(reference, (BLUE, ORANGE, GREEN, "#CC79A7")))
+    curves: dict[str, detection.Roc] = {}
+    colours = dict(zip(reference, plot.COLOURS))
     for length, expected in reference.items():
         J0 = np.asarray(detection.windowed(evaluations[0], length))[500:]
         J2 = np.asarray(detection.windowed(evaluations[2], length))[window].max(axis=0)
@@ -329,15 +330,14 @@ def detection_table(report: Report) -> None:
         )  # 0.05: the threshold rests on few samples
         report.check(f"ROC at false alarms 1e-4 per sample, 2 std, N = {length}", expected, found, allowed, "spec, 7")
         curve = detection.roc(J0, J2, np.quantile(J0, 1 - np.geomspace(1e-5, 1, 200)))
-        ax.semilogx(np.maximum(curve.false_alarm, 1e-6), curve.detection, color=colours[length], label=f"N = {length}")
+        curves[f"N = {length}"] = curve
         threshold = np.quantile(J0, 1 - 1e-4)
         alarms = np.asarray(detection.windowed(evaluations[2], length)) > threshold
         delays = detection.first_alarm(alarms, DT * np.arange(len(alarms)), 100.0)
         times = np.linspace(0, 9.9, 100)
         ax_delay.plot(times, detection.detected_by(delays, times), color=colours[length], label=f"N = {length}")
-    chance_at = np.geomspace(1e-5, 1, 50)
-    ax.plot(chance_at, detection.chance(chance_at, 100), color=GREY, ls=":", label="chance, 100 independent samples")
-    ax.set(xlabel="false alarms per sample [1]", ylabel="P(alarm within 10 s) [1]", xlim=(1e-5, 1), ylim=(0, 1.02))
+    plot.roc(curves, samples=100, least=1e-5, ax=ax)
+    ax.set(ylabel="P(alarm within 10 s) [1]")
     ax.set_title("constant fault of 2 std, roll star")
     ax.legend(loc="lower right", fontsize=8)
     ax_delay.set(xlabel="time after the fault [s]", ylabel="share detected [1]", ylim=(0, 1.02), xlim=(0, 10))

@@ -19,6 +19,8 @@ MAY = {
     "engine": {"check", "scores", "vec"},
     "linear": PLAIN | {"engine"},
     "study": {"check", "engine"},
+    "replay": PLAIN | {"faults", "engine"},
+    "plot": PLAIN | ALGEBRA | PARTS,
     "systems": PLAIN | ALGEBRA | PARTS | {"engine"},
 }
 
