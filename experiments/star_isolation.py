@@ -19,6 +19,7 @@ import optax
 from experiments.report import Report, interval, plt
 from jaxatt import Fault, Quat, Vec3, detection, plot, scores, simulate, sweep, tune
 from jaxatt.estimators import lmmse_predict, lmmse_start, lmmse_update
+from jaxatt.replay import replay
 from jaxatt.systems.star_isolation import (
     ARCSEC,
     DEG,
@@ -30,11 +31,12 @@ from jaxatt.systems.star_isolation import (
     TURN,
     WITH_BIAS,
     Scenario,
+    decide,
+    init,
     on_sensor,
     orbit_rate,
     params,
     quaternion_error,
-    replay,
     scenario,
     score,
     seen,
@@ -641,7 +643,9 @@ def _map(s: np.ndarray) -> np.ndarray:
 def likelihood(theta, readings):
     """Mean negative log likelihood of the innovations of both filters, theta = log (sg, ss) believed / true."""
     p = params._replace(std_gyro=params.std_gyro * jnp.exp(theta["gyro"]), std_star=STD * jnp.exp(theta["star"]))
-    of = replay(LMMSE, p, spread(healthy, readings.gyro.x.shape[1]).q_hat, readings)
+    n = readings.gyro.x.shape[1]
+    start = jax.tree.map(lambda a: jnp.broadcast_to(a[..., None], (*a.shape, n)), init(LMMSE, 1, p, healthy)[1].board)
+    of = jax.tree.map(lambda a: a[1:], replay(decide, p, start, readings, dt=DT)[1].innovation)
     return 0.5 * jnp.mean(of.log_det + of.nis)
 
 

@@ -70,7 +70,7 @@ def test_lines_and_words_are_seen_on_light_and_dark(name, style):
     with plt.style.context(style):
         axes = np.ravel(FIGURES[name]())
         figure = axes[0].figure
-        figure.canvas.draw()
+        figure.draw_without_rendering()
         behind = figure.get_facecolor()
         drawn = [a for ax in figure.axes for a in (*ax.lines, *ax.texts, ax.title, ax.xaxis.label, ax.yaxis.label)]
         drawn += [t for ax in figure.axes if ax.get_legend() for t in ax.get_legend().get_texts()]
