@@ -26,6 +26,7 @@ from jaxatt import check
 from jaxatt.engine import Now, compiled, like, rk4
 from jaxatt.faults import Reading
 
+EXAMPLE = Path(__file__).parent / "data" / "telemetry.csv"  # made by notebooks/telemetry.py, with a hidden fault
 SPARSE = 1000  # ticks per sample beyond which the times are taken to be wrong
 
 
