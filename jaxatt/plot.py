@@ -103,15 +103,17 @@ def overview(
 ) -> np.ndarray:
     """One run over time: a panel for every quantity, fault onsets marked, thresholds dashed, alarms shaded.
 
-    t: (T,) [s]. panels: by axis label with unit, values of shape (T,), (T, k) or a `Vec3` of (T,). faults: onsets
-    [s] by name, as `fault_times` gives them. thresholds: by the label of their panel. alarm: (T,) bool.
+    t: (T,) [s]. panels: by axis label with unit, values of shape (T,) or (T, k), a `Vec3` of (T,) or several (T,) by
+    name. faults: onsets [s] by name, as `fault_times` gives them. thresholds: by the label of their panel. alarm: (T,) bool.
     Returns the axes, one for each panel.
     """
     axes = _new(axes, nrows=len(panels), sharex=True, squeeze=False, figsize=(8, 1 + 1.9 * len(panels)))
     axes, t = np.ravel(axes), np.asarray(t)
     for ax, (label, values) in zip(axes, panels.items()):
-        lines = {"": values}
-        if isinstance(values, tuple):
+        lines: Mapping[str, Any] = {"": values}
+        if isinstance(values, Mapping):
+            lines = values
+        elif isinstance(values, tuple):
             lines = dict(zip(getattr(values, "_fields", map(str, range(1, 1 + len(values)))), values))
         elif np.ndim(values) == 2:
             lines = {str(i + 1): column for i, column in enumerate(np.asarray(values).T)}
@@ -119,7 +121,7 @@ def overview(
             ax.plot(t, line, LINES[i % 4], color=COLOURS[i % 4], linewidth=1.1, label=name or None)
         level = (thresholds or {}).get(label)
         if level is not None:
-            ax.axhline(float(level), color=COLOURS[1], linestyle="--", label="threshold")
+            ax.axhline(float(level), color=plt.rcParams["text.color"], linestyle="--", label="threshold")
         if alarm is not None:
             on = np.asarray(alarm, bool)
             ax.fill_between(t, 0, 1, where=on, transform=ax.get_xaxis_transform(), color=GREY, alpha=0.25,

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jax.flatten_util import ravel_pytree
-from tqdm.auto import tqdm
+from tqdm import tqdm
 
 from jaxatt import check
 from jaxatt.engine import BLOCK, System, admit, block_log, block_scores, compiled, raw_key, traced
