@@ -315,21 +315,21 @@ def subsets(out, values: Mapping[str, Any], *, names: str = "ABCD", what: str = 
 # momentum
 
 
-def singular_surface(gimbals: GimbalAxes, reversed: int = 0, ax=None) -> Axes:
+def singular_surface(gimbals: GimbalAxes, reversed: int = 0, ax=None, *, fine: int = 80) -> Axes:
     """The singular momenta of a cluster with so many modules reversed, 0 for the envelope, and the rims of its holes.
 
-    gimbals: (n,) without lanes. ax: three-dimensional. Momenta are in units of one module's, h_w. Circles and
-    discs: a module's gimbal axis lies along the singular direction.
+    gimbals: (n,) without lanes. ax: three-dimensional. fine: patches from pole to pole. Momenta are in units of one
+    module's, h_w. Circles and discs: a module's gimbal axis lies along the singular direction.
     """
     ax = plt.figure(figsize=(5.5, 5), layout="constrained").add_subplot(projection="3d") if ax is None else ax
-    polar, around = np.meshgrid(np.linspace(0, np.pi, 81), np.linspace(0, 2 * np.pi, 161), indexing="ij")
+    polar, around = np.meshgrid(np.linspace(0, np.pi, fine + 1), np.linspace(0, 2 * np.pi, 2 * fine + 1), indexing="ij")
     u = Vec3(np.sin(polar) * np.cos(around), np.sin(polar) * np.sin(around), np.cos(polar))
     n = gimbals.r.x.shape[0]
     patterns = [e for e in sg.sign_patterns(n) if min((e < 0).sum(), n - (e < 0).sum()) == reversed]
     size = 0.0
     for signs in patterns:
         h, _ = sg.singular_momentum(gimbals, Vec3(*(a.ravel() for a in u)), signs)
-        p = np.asarray(array(h)).T.reshape(81, 161, 3)
+        p = np.asarray(array(h)).T.reshape(*polar.shape, 3)
         quads = np.stack([p[:-1, :-1], p[1:, :-1], p[1:, 1:], p[:-1, 1:]], axis=2).reshape(-1, 4, 3)
         whole = np.linalg.norm(quads - np.roll(quads, 1, axis=1), axis=-1).max(1) < 1.1  # no bridge over a hole
         quads = quads[whole & np.isfinite(quads).all((1, 2))]

@@ -50,7 +50,7 @@ FIGURES = {
     "roc": lambda: plot.roc({"a": detection.roc(RNG.normal(size=99), 1 + RNG.normal(size=99))}, samples=10),
     "pareto": lambda: plot.pareto(DATA, "size [rad/s]", "onset [s]", marked={"paper": 0, "tuned": 1}),
     "subsets": lambda: plot.subsets(OUT, {"settling [s]": {"a": np.arange(16.0), "b": np.full(16, np.inf)}}),
-    "singular_surface": lambda: plot.singular_surface(cmg_loss.scenario.axes, 1),
+    "singular_surface": lambda: plot.singular_surface(cmg_loss.scenario.axes, 1, fine=12),
 }  # fmt: skip
 
 
