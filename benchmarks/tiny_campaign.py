@@ -1,6 +1,9 @@
-"""A campaign on a loop of one mass, small enough to be run in many processes: ``python tiny_campaign.py PATH ...``."""
+"""A campaign on a loop of one mass, small enough to be run, and killed, in many processes."""
 
-import sys
+from __future__ import annotations
+
+import time
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -9,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxatt import System, check, scores
+from jaxatt.campaign import Campaign, run
 
 
 class Params(NamedTuple):
@@ -78,29 +82,47 @@ def record(log):
 system = System(init, tick, flow, dt=0.1, substeps=2, normals=1, check=refuse_bad)
 
 
-def campaign(block=128, **change):
-    from jaxatt.campaign import Campaign
-
+def campaign(block: int = 128, **change):
     one = Campaign(system, Params(), sample, jax.random.key(3), 30, score, inputs=draw, block=block)
     return one._replace(**{"units": {"rms": "m", "far": "s", "start": "m"}, **change})
 
 
-def main(path, n, block, shard, *words):
-    """Run a campaign, and say so when the first block is there."""
-    import jaxatt.campaign as module
-
+def work(path, blocks, block=128, shard=(0, 1), **change):
+    """Run the campaign in a process of its own."""
     jax.config.update("jax_enable_x64", True)
-    write = module._write
-
-    def told(*args):
-        write(*args)
-        print("written", flush=True)
-
-    module._write = told
-    shard = tuple(map(int, shard.split("/")))
-    more = dict(record=record, every=10) if "record" in words else {}
-    module.run(Path(path), campaign(int(block), **more), int(n), shard=shard, progress=False)
+    run(Path(path), campaign(block, **change), blocks * block, shard=shard, progress=False)
 
 
-if __name__ == "__main__":
-    main(*sys.argv[1:])
+class Death(NamedTuple):
+    """What a killed run left."""
+
+    blocks: int  # that count as done
+    inside: bool  # a block was being written
+
+
+def processes():
+    """Processes that start with everything imported, and nothing computed."""
+    context = get_context("forkserver")
+    context.set_forkserver_preload([__name__])
+    return context
+
+
+def killed(context, path: Path, blocks: int, moment: float, warm: bool = True, **change) -> Death:
+    """Start a campaign, kill -9 it ``moment`` seconds after its first block (warm) or after its start."""
+    process = context.Process(target=work, args=(path, blocks), kwargs=change)
+    process.start()
+    while warm and process.is_alive() and not (path / "done" / "c" / "0").exists():
+        time.sleep(0.001)
+    time.sleep(moment)
+    process.kill()
+    process.join()
+    marked = {int(f.name) for f in path.glob("done/c/*") if f.name.isdigit()}
+    chunks = {
+        int(f.name.split(".")[0]) for f in path.glob("*/c/**/*") if f.is_file() and f.name.split(".")[0].isdigit()
+    }
+    return Death(len(marked), bool(chunks - marked))
+
+
+def files(path: Path) -> dict[str, bytes]:
+    """Every file of a store, by its place in it."""
+    return {str(f.relative_to(path)): f.read_bytes() for f in sorted(path.rglob("*")) if f.is_file()}
