@@ -285,6 +285,9 @@ def _refuse_other(path: Path, stored: Mapping, now: Mapping, accept: Collection[
 # the store
 
 
+_WHOLE = {"array.write_empty_chunks": True}  # a missing file shall mean a missing block; read as arrays are opened
+
+
 class Store(NamedTuple):
     """An open store."""
 
@@ -299,12 +302,6 @@ class Store(NamedTuple):
         return block * size, min((block + 1) * size, self.manifest["n"])
 
 
-@contextmanager
-def _writing():
-    with zarr.config.set({"array.write_empty_chunks": True}):  # a missing file must mean a missing block
-        yield
-
-
 def _blocks(n: int, block: int) -> int:
     return -(-n // block)
 
@@ -315,15 +312,16 @@ def _created(path: Path, campaign: Campaign, n: int) -> None:
     new = path.with_name(path.name + ".new")
     shutil.rmtree(new, ignore_errors=True)  # of a run that was killed just here
     path.parent.mkdir(parents=True, exist_ok=True)
-    with _writing():
+    with zarr.config.set(_WHOLE):
         group = zarr.create_group(new, zarr_format=3, attributes={"campaign": manifest, "variables": list(variables)})
         codecs: list = [ZstdCodec(level=1), Crc32cCodec()]
         for name, v in variables.items():
             flags = {"flag_values": [0, 1, 2], "flag_meanings": " ".join(STATUS)} if v.role == "status" else {}
             unit = {"units": campaign.units[name]} if name in campaign.units else {}
+            nothing: Any = {"f": np.nan, "i": -1}.get(v.dtype.kind, 0)
             group.create_array(
                 name, shape=(*v.shape, n), chunks=(*(max(a, 1) for a in v.shape), campaign.block), dtype=v.dtype,
-                compressors=codecs, dimension_names=v.dims, attributes={"role": v.role, **flags, **unit},
+                compressors=codecs, fill_value=nothing, dimension_names=v.dims, attributes={"role": v.role, **flags, **unit},
             )  # fmt: skip
         group.create_array(
             OWN, shape=(_blocks(n, campaign.block),), chunks=(1,), dtype=np.uint64, fill_value=0, compressors=codecs,
@@ -344,11 +342,12 @@ def _opened(path: Path, mode: Any = "r") -> Store:
     if not path.exists():
         raise FileNotFoundError(f"`path` must be the store of a campaign, but there is nothing at {path}.")
     try:
-        group = zarr.open_group(path, mode=mode, zarr_format=3)
+        with zarr.config.set(_WHOLE):
+            group = zarr.open_group(path, mode=mode, zarr_format=3)
+            arrays = {name: array for name, array in group.arrays() if name != "time"}
         manifest: Any = group.attrs["campaign"]
     except (KeyError, FileNotFoundError, ValueError, TypeError) as error:
         raise ValueError(f"`path` must be the store of a campaign, but {path} is not: {error}.") from error
-    arrays = {name: array for name, array in group.arrays() if name != "time"}
     return Store(path, group, arrays, dict(manifest))
 
 
@@ -356,14 +355,13 @@ def _sized(store: Store, n: int) -> Store:
     """The store for n scenarios. The manifest speaks last: a run killed in between is made good by the next."""
     last, block = store.manifest["n"], store.manifest["block"]
     wanted = {name: n for name in store.arrays} | {OWN: _blocks(n, block)}
-    with _writing():
-        if n != last and last % block:
-            store.arrays[OWN][last // block] = 0  # the last block was not full and has to grow
-        for name, array in store.arrays.items():
-            if array.shape[-1] != wanted[name]:
-                array.resize((*array.shape[:-1], wanted[name]))
-        if n != last:
-            store.group.attrs["campaign"] = {**store.manifest, "n": n}
+    if n != last and last % block:
+        store.arrays[OWN][last // block] = 0  # the last block was not full and has to grow
+    for name, array in store.arrays.items():
+        if array.shape[-1] != wanted[name]:
+            array.resize((*array.shape[:-1], wanted[name]))
+    if n != last:
+        store.group.attrs["campaign"] = {**store.manifest, "n": n}
     return _opened(store.path, "r+")
 
 
@@ -375,10 +373,9 @@ def _read(store: Store, block: int) -> dict[str, np.ndarray]:
 def _write(store: Store, block: int, values: dict[str, np.ndarray]) -> None:
     """Write a block; its checksum comes last and makes it one."""
     start, stop = store.span(block)
-    with _writing():
-        for name, a in values.items():
-            store.arrays[name][..., start:stop] = a
-        store.arrays[OWN][block] = _checksum(values)
+    for name, a in values.items():
+        store.arrays[name][..., start:stop] = a
+    store.arrays[OWN][block] = _checksum(values)
 
 
 def _checksum(values: dict[str, np.ndarray]) -> np.uint64:
