@@ -19,7 +19,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import ndtri
 
-import jaxatt
 from jaxatt import Fault, Quat, Vec3, designs, on_axes
 from jaxatt.campaign import Campaign, extend, run
 from jaxatt.faults import dead
@@ -261,8 +260,6 @@ def main(name: str, words: list[str]) -> int:
     path = out / "campaign.zarr"
     if path.exists() and not args.resume and args.shard[1] == 1:
         parser.error(f"{path} is there already: give --resume to go on with it, or another --out.")
-    jax.config.update("jax_enable_x64", True)
-    jaxatt.fast_cpu()
     again = " ".join([parser.prog, *words, *([] if args.resume else ["--resume"])])
     started = time.perf_counter()
     try:
