@@ -290,7 +290,7 @@ def draw_sensitivity(dataset, title: str, file: Path) -> None:
     index, floor = index[rows], floor[rows]
     names = [str(s) for s in found.score.values[rows]]
     fig, ax = plt.subplots(figsize=(2.5 + 0.6 * index.shape[1], 1.5 + 0.28 * len(names)), layout="constrained")
-    shown = np.where(index > floor, index, np.nan)
+    shown = np.where(index > np.maximum(floor, 0.005), index, np.nan)
     image = ax.imshow(shown, cmap="viridis_r", vmin=0, vmax=1, aspect="auto")
     for i, j in np.argwhere(shown > 0):
         ax.text(
@@ -299,7 +299,7 @@ def draw_sensitivity(dataset, title: str, file: Path) -> None:
     ax.set_xticks(range(index.shape[1]), [str(a) for a in found.input.values], rotation=60, ha="right")
     ax.set_yticks(range(len(names)), names)
     ax.set(xlabel="input", ylabel="score")
-    ax.set_title(f"{title}\nblank: below the noise floor", fontsize="medium")
+    ax.set_title(f"{title}\nblank: below the noise floor or 0.5 %", fontsize="medium")
     fig.colorbar(image, ax=ax, label="first-order share of the variance [1]")
     fig.savefig(file, dpi=150)
     plt.close(fig)
