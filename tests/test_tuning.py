@@ -15,6 +15,7 @@ import pytest
 from jaxatt import System, scores, sweep
 from jaxatt.tuning import (
     FEW,
+    averaged,
     best_of,
     bounded,
     gradient_check,
@@ -207,16 +208,18 @@ def test_the_worst_case_is_found_within_its_box():
 # devices
 
 
-DEVICES = """
-import sys, jax, numpy as np, optax
-from jaxatt.tuning import averaged
+TWO_DEVICES = """
+import sys, jax, numpy as np
 sys.path.insert(0, "tests")
 import conftest, test_tuning as t
-assert jax.local_device_count() == int(sys.argv[2])
-best, history = t.tune(averaged(t.swept, 4), np.ones(2), optax.adam(0.1), 3, t.KEY)
-single = np.mean([t.swept(np.ones(2), key) for key in jax.random.split(t.KEY, 4)])
-np.savez(sys.argv[1], best=best, cost=history.cost, gradient=history.gradient, single=single)
+assert jax.local_device_count() == 2
+best, history = t.shared_search()
+np.savez(sys.argv[1], best=best, cost=history.cost, gradient=history.gradient)
 """
+
+
+def shared_search():
+    return tune(averaged(swept, 4), np.ones(2), optax.adam(0.1), 3, KEY)
 
 
 def swept(theta, key):
@@ -233,15 +236,13 @@ def swept(theta, key):
 
 
 def test_draws_are_shared_by_devices_and_average_the_cost(tmp_path):
-    results = []
-    for devices in (1, 2):
-        env = os.environ | {"XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}", "PYTHONPATH": str(ROOT)}
-        out = tmp_path / f"{devices}.npz"
-        subprocess.run([sys.executable, "-c", DEVICES, out, str(devices)], env=env, cwd=ROOT, check=True)
-        results.append(dict(np.load(out)))
-    assert results[0]["cost"][0] == pytest.approx(results[0]["single"], rel=1e-12)
-    for name in results[0]:
-        np.testing.assert_allclose(results[0][name], results[1][name], rtol=1e-9)
+    env = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "PYTHONPATH": str(ROOT)}
+    subprocess.run([sys.executable, "-c", TWO_DEVICES, tmp_path / "two.npz"], env=env, cwd=ROOT, check=True)
+    two = np.load(tmp_path / "two.npz")
+    best, history = shared_search()
+    assert history.cost[0] == pytest.approx(np.mean([swept(np.ones(2), key) for key in jax.random.split(KEY, 4)]))
+    for name, one in dict(best=best, cost=history.cost, gradient=history.gradient).items():
+        np.testing.assert_allclose(two[name], one, rtol=1e-9)
 
 
 # whether to believe a gradient
@@ -249,7 +250,8 @@ def test_draws_are_shared_by_devices_and_average_the_cost(tmp_path):
 
 def test_the_gradient_check_knows_a_smooth_cost_from_a_staircase():
     smooth = gradient_check(wavy, start(), KEY)
-    assert smooth.relative.max() < 1e-2 and (smooth.doubt < 1e-2).all()  # float32: the difference is the worse one
+    assert smooth.relative.max() < 1e-8 and (smooth.doubt < 1e-7).all()
     stairs = lambda theta, key: jnp.floor(20 * theta) / 20 + 0.1 * theta
     lying = gradient_check(stairs, 0.317, KEY, step=0.03)
-    assert lying.gradient[0] == pytest.approx(0.1) and lying.central[0] > 0.5 and lying.doubt[0] > 0.05
+    assert lying.gradient[0] == pytest.approx(0.1)
+    assert abs(lying.central[0] - 0.1) > 0.2 and lying.doubt[0] > 0.2 and lying.relative[0] > 1
