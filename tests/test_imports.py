@@ -19,6 +19,8 @@ MAY = {
     "engine": {"check", "scores", "vec"},
     "linear": PLAIN | {"engine"},
     "study": {"check", "engine"},
+    "tuning": {"check", "engine", "study"},
+    "objectives": PLAIN | ALGEBRA,
     "systems": PLAIN | ALGEBRA | PARTS | {"engine"},
 }
 
