@@ -1,1 +1,1 @@
-"""Gains by gradient: for each paper's loop a study of what tuning buys, ``python -m experiments NAME tune``."""
+"""Gains tuned by gradient, one module per closed loop."""
