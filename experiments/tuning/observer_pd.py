@@ -8,8 +8,6 @@ and draw on, and one for the verdict, which no number was chosen on.
 
 from __future__ import annotations
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
@@ -56,7 +54,7 @@ def run(report) -> None:
     best_random = fronts(report, reference, found)
     verdict(report, reference, found, best_random)
     way(report, history)
-    # worst(report, found[0])
+    worst(report, found[0])
     budget(report, reference)
 
 
@@ -343,3 +341,89 @@ def budget(report, reference: dict) -> None:
     races = compare.contest(report, descent, compare.one_by_one(one), flat, low, high,
                             steps * compare.gradient_price(flat.size), "1", seeds)  # fmt: skip
     del races
+
+
+# the scenario as the unknown
+
+REST = QUIET._replace(
+    q=Vec3(0.0, 0.0, 0.0), w=Vec3(0.0, 0.0, 0.0), q_hat=Vec3(0.0, 0.0, 0.0), w_hat=Vec3(0.0, 0.0, 0.0)
+)
+BIASED = jax.tree.map(float, Fault(onset=1.0, tau=5.0))
+
+
+def growing(gyro, star) -> op.Scenario:
+    """A body at rest on whose sensors offsets grow from 1 s on, with 5 s as time constant; gyro, star: (3,)."""
+    faulty = lambda sizes: Vec3(*(BIASED._replace(drift=size) for size in sizes))
+    return REST._replace(gyro=faulty(gyro), star=faulty(star))
+
+
+def degrees(mrp):
+    """The angle [deg] of an MRP of this norm."""
+    return 4 * np.degrees(np.arctan(mrp))
+
+
+def worst(report, balanced: dict) -> None:
+    """Faults found by gradient: the one that errs most without an alarm, and the onset that hurts a slew most."""
+    steps = 30 if report.quick else 80
+    quiet = jnp.zeros((250, 6))
+    fig, (left, right) = plt.subplots(1, 2, figsize=(10, 3.8), layout="constrained")
+    box = {"gyro": np.full(3, 0.1), "star": np.full(3, 0.1)}
+    silent = {}
+    for label, gains, colour in (("paper's", PAPER, ORANGE), ("balanced", balanced, BLUE)):
+        params = op.params._replace(**gains)
+
+        def harm(fault, key, params=params):
+            log = simulate(op.system, params, growing(**fault), quiet, ticks=250)
+            damage = jnp.mean(norm(log.e_q)[-20:])
+            return damage / 0.01 - 100 * penalty(jnp.max(log.xi) / params.sigma - 0.98)
+
+        low = jax.tree.map(np.negative, box)
+        rate = optax.cosine_decay_schedule(0.2, steps, 0.02)
+        fault, history = worst_case(harm, low, box, optax.adam(rate), steps, TUNING, starts=6)
+        log = simulate(op.system, params, growing(**fault), quiet, ticks=250)
+        silent[label] = degrees(float(jnp.mean(norm(log.e_q)[-20:])))
+        ends = np.sort(history.cost.max(0))
+        report.note(
+            f"{label}: silent fault, gyro {np.round(np.asarray(fault['gyro']), 4)} rad/s, star sensor "
+            f"{np.round(np.asarray(fault['star']), 4)}: {silent[label]:.2f} deg; harm of the starts {np.round(ends, 2)}"
+        )
+        report.within(f"{label}: no alarm at its worst silent fault, peak |xi| / sigma", None, 1,
+                      float(jnp.max(log.xi)) / gains["sigma"], "silent")  # fmt: skip
+        t = op.DT * np.arange(250)
+        left.plot(t, degrees(np.asarray(norm(log.e_q))), color=colour, label=f"{label} gains: error")
+        left.plot(t, 10 * np.asarray(log.xi) / gains["sigma"], color=colour, ls=":",
+                  label=f"{label} gains: residual, threshold = 10")  # fmt: skip
+    left.axhline(10, color="0.5", lw=0.8)
+    left.set(xlabel="time [s], faults grow from 1 s on", ylabel="attitude error [deg]; 10 residual / threshold",
+             title="the fault that errs most without alarm")  # fmt: skip
+    left.legend(fontsize=8)
+    report.within("worst silent error, balanced / paper's gains", None, 1, silent["balanced"] / silent["paper's"],
+                  "by gradient in the fault")  # fmt: skip
+
+    ticks, params = 150, op.params
+    noise = jnp.zeros((ticks, 6))
+    healthy = norm(simulate(op.system, params, QUIET, noise, ticks=ticks).e_q)
+
+    def lateness(fault, key):
+        way = Vec3(*fault["way"])
+        drift = (0.05 / norm(way)) * way
+        gyro = Vec3(*(Fault()._replace(onset=fault["onset"], drift=d, tau=0.5) for d in drift))
+        log = simulate(op.system, params, QUIET._replace(gyro=gyro), noise, ticks=ticks)
+        return 100 * jnp.sqrt(jnp.mean((norm(log.e_q) - healthy)[80:] ** 2))
+
+    low, high = dict(onset=0.1, way=np.full(3, -1.0)), dict(onset=12.0, way=np.full(3, 1.0))
+    fault, history = worst_case(lateness, low, high, optax.adam(0.15), steps, TUNING, starts=8)
+    grid = np.linspace(0.15, 11.9, 48)
+    along = jax.jit(jax.vmap(lambda onset: lateness(dict(onset=onset, way=fault["way"]), TUNING)))(jnp.asarray(grid))
+    right.plot(grid, along, color="0.4", label="that direction, every onset")
+    right.scatter(history.theta["onset"][-1], history.cost[-1], color=BLUE, zorder=3, label="ends of 8 ascents")
+    right.scatter(fault["onset"], history.cost.max(), s=120, marker="*", color=GREEN, zorder=4, label="worst found")
+    right.set(xlabel="onset of a gyro fault of 0.05 rad/s [s]", ylabel="rms added error, 8-15 s [0.01 MRP]",
+              title="the onset that hurts a slew most")  # fmt: skip
+    right.legend(fontsize=8)
+    report.note(
+        f"worst onset {float(fault['onset']):.2f} s: {history.cost.max():.3f}, best of the grid {along.max():.3f}"
+    )
+    report.within("harm at the worst onset found / largest on a grid", 0.99, None,
+                  float(history.cost.max() / along.max()), "48 onsets")  # fmt: skip
+    report.figure("worst", fig)
