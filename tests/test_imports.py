@@ -22,6 +22,8 @@ MAY = {
     "designs": {"check"},
     "summary": {"check"},
     "campaign": {"check", "engine", "study", "summary"},
+    "tuning": {"check", "engine", "study"},
+    "objectives": PLAIN | ALGEBRA,
     "systems": PLAIN | ALGEBRA | PARTS | {"engine"},
 }
 
