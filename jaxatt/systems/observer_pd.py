@@ -15,7 +15,7 @@ from numpy import sqrt
 from jaxatt import check, scores
 from jaxatt.attitude import mrp_error, mrp_inner, mrp_nearest, mrp_rate
 from jaxatt.bodies import body_acceleration
-from jaxatt.controllers import adapted_rate_gain, pd, saturated
+from jaxatt.controllers import adapted_rate_gain, pd, rate_gain_floor, saturated
 from jaxatt.engine import System
 from jaxatt.estimators import AttitudeRate, mrp_observer, residual_norm
 from jaxatt.faults import Channel, Fault, any_active, check_fault, first_onset, on_axes
@@ -220,6 +220,32 @@ def score(params: Params, scenario: Scenario, now, log: Log) -> Scores:
         rms_u_ill=scores.rms(uu, ill),
         peak_u=scores.peak(norm(log.u)),
         ok=scores.always(scores.finite(log)),
+    )
+
+
+class Margins(NamedTuple):
+    """What the paper's proof of stability leaves; all positive: it holds there."""
+
+    k_q: Any  # [N m] above the least attitude gain, eq. (18)
+    eps: Any  # [1/s] below the largest epsilon with Q > 0, after eq. (12)
+    T: Any  # [N m/s] of T_I > 0, eq. (16), for constant gains
+
+
+def margins(params: Params, lambda_max, e_q=0.0, e_w=0.0) -> Margins:
+    """The margins at tracking errors of norms e_q [1] and e_w [rad/s], with k_w = k_w0.
+
+    lambda_max: largest principal moment of the believed inertia [kg m^2]. Pure: its penalty keeps a search of gains
+    where the proof holds. The adaptation (19) leaves that region in time whatever the gains are (spec, 5.7).
+    """
+    eps, k_q = params.eps, params.k_q
+    c = eps * lambda_max * e_w + 1 + e_q * e_q
+    room = params.k_w0 - rate_gain_floor(Vec3(e_q, 0.0, 0.0), eps, lambda_max)
+    positive = room > 0
+    held = eps * k_q - 0.5 * eps * eps - 1 - c * c / jnp.where(positive, room, 1)
+    return Margins(
+        k_q=k_q - eps / 2 - 1 / eps,
+        eps=2 / jnp.sqrt(lambda_max) - eps,
+        T=jnp.where(positive, held, room - 1),
     )
 
 
