@@ -31,13 +31,13 @@ from experiments.tuning.compare import (
     told,
 )
 from jaxatt import scores, simulate, sweep, tune
-from jaxatt.tuning import multi_start
 from jaxatt.engine import Now
 from jaxatt.linear import growth_rates, sampled
 from jaxatt.mounting import total
 from jaxatt.objectives import growth_rate, penalty
 from jaxatt.systems import gyro_ekf
-from jaxatt.systems.gyro_ekf import ANGLE, CONTROL, DEG, DT, INERTIA, RATE, Params, Scenario, direct, failed, params
+from jaxatt.systems.gyro_ekf import CONTROL, DEG, DT, INERTIA, Params, Scenario, direct, failed, params
+from jaxatt.tuning import multi_start
 from jaxatt.vec import Mat3, Vec3, array
 
 NAMES = ("k_p", "k_i", "k_d")
@@ -127,6 +127,18 @@ def least_growth(several: list[Loops], starts: int, steps: int) -> np.ndarray:
     return rates.min(1)
 
 
+def x_axis(p, q):
+    """Matrix (..., 3, 3) of the x loop alone without rate feedback: integral, angle, rate times the period T.
+
+    p = K_F K_P T^2 / (2 J), q = K_F K_I T^3 / (6 J).
+    """
+    p, q = np.broadcast_arrays(p, q)
+    free = np.array([[1, 1, 0.5], [0, 1, 1], [0, 0, 1]])
+    push = np.array([1 / 6, 0.5, 1.0])
+    gain = np.stack([6 * q, 2 * p, 0 * p], axis=-1)
+    return free - push[:, None] * gain[..., None, :]
+
+
 def without_filter(report) -> None:
     """Part 1."""
     nominal = loops()
@@ -195,7 +207,9 @@ def why_not_both(report, nominal: Loops) -> None:
     report.within("B and C dead: least growth in the box, the paper's inertia [1/s]", 0.0, None, least[1],
                   f"{starts} searches, gains 1/100 to 100 x")  # fmt: skip
     for f, g in zip(factors, least):
-        report.note(f"  J_xy, J_xz, J_yz x {f:g}: least growth rate found {1e3 * g:.4f}e-3 1/s; x alone {1e3 * alone:.4f}e-3")
+        report.note(
+            f"  J_xy, J_xz, J_yz x {f:g}: least growth rate found {1e3 * g:.4f}e-3 1/s; x alone {1e3 * alone:.4f}e-3"
+        )
 
 
 def growth_figure(report, paper, tuned, history) -> None:
@@ -330,15 +344,21 @@ def pid_gains(report) -> None:
 
     budget = 60 if report.quick else 200
     price = gradient_price(6)
-    races = contest(report, descent(history, price), one_by_one(lambda x: cost(x, None)), np.zeros(6),
+    contest(report, descent(history, price), one_by_one(lambda x: cost(x, None)), np.zeros(6),
                     np.full(6, -PID_BOX), np.full(6, PID_BOX), budget, "of the paper's gains", seeds=range(2))  # fmt: skip
 
     # chosen on other states
     other = drawn(CHOOSE, np.tile(every, 2))
     judged = [float(jnp.mean(pid_costs(theta, other, CHOOSE))) for theta in history.theta]
     best = history.theta[int(np.argmin(judged))]
-    report.note(f"cost, of the paper's gains: tuned on {history.cost.min():.4f}, chosen on {min(judged) / judged[0]:.4f}")
-    report.note("factors on the paper's gains, x, y, z: K_P and K_I {:.3g}, {:.3g}, {:.3g}; K_D {:.3g}, {:.3g}, {:.3g}".format(*np.exp(best)))
+    report.note(
+        f"cost, of the paper's gains: tuned on {history.cost.min():.4f}, chosen on {min(judged) / judged[0]:.4f}"
+    )
+    report.note(
+        "factors on the paper's gains, x, y, z: K_P and K_I {:.3g}, {:.3g}, {:.3g}; K_D {:.3g}, {:.3g}, {:.3g}".format(
+            *np.exp(best)
+        )
+    )
 
     n = 8 if report.quick else 64
     fresh = drawn(VERDICT, np.repeat(every, n))
@@ -351,7 +371,9 @@ def pid_gains(report) -> None:
     for name, unit, what in VERDICT_TABLE:
         report.note(told(what, paired_ratio(before[name].mean(0) / unit, after[name].mean(0) / unit), ratio=True))
     ratio = paired_ratio(before["cost"].mean(0), after["cost"].mean(0))
-    report.within("PID cost of the 16-subset mean, tuned / paper's, held-out", None, 0.85, ratio.change, f"{n} initial states")
+    report.within(
+        "PID cost of the 16-subset mean, tuned / paper's, held-out", None, 0.85, ratio.change, f"{n} initial states"
+    )
     report.within("  upper end of its paired 95 % interval", None, 0.85, ratio.high, "bootstrap over states")
     report.within("  settling to 0.01 deg, all subsets [s]", None, 600.0, after["settling"].max(), "the run's end")
     pid_figure(report, before, after)
@@ -373,9 +395,16 @@ VERDICT_TABLE = [
 def pid_figure(report, before, after) -> None:
     fig, axes = plt.subplots(3, 1, figsize=(9, 7), sharex=True, layout="constrained")
     place = np.arange(16)
-    rows = (("angle", DEG, "rms angle, 80 s [deg]"), ("settling", 1.0, "settling to 0.01 deg [s]"), ("torque", 1.0, "rms torque, 80 s [in-lbf]"))
+    rows = (
+        ("angle", DEG, "rms angle, 80 s [deg]"),
+        ("settling", 1.0, "settling to 0.01 deg [s]"),
+        ("torque", 1.0, "rms torque, 80 s [in-lbf]"),
+    )
     for ax, (name, unit, label) in zip(axes, rows):
-        for offset, values, colour, who in ((-0.2, before, COLOURS[0], "paper's gains"), (0.2, after, COLOURS[1], "tuned")):
+        for offset, values, colour, who in (
+            (-0.2, before, COLOURS[0], "paper's gains"),
+            (0.2, after, COLOURS[1], "tuned"),
+        ):
             mean = values[name].mean(1) / unit
             half = 1.96 * values[name].std(1, ddof=1) / unit / np.sqrt(values[name].shape[1])
             ax.bar(place + offset, mean, 0.4, yerr=half, color=colour, label=who, ecolor="0.3", capsize=2)
@@ -397,25 +426,24 @@ FROM = 160  # [ticks] before, the innovations are those of the start
 
 
 def filter_with(levels) -> Params:
-    """The filter with the six levels (6,); P0 as its readings deserve."""
+    """The filter with the six levels (6,) and initial variances on the scale of its readings."""
     R = jnp.repeat(levels[:3], np.array([3, 4, 4]), total_repeat_length=11)
     Q = jnp.concatenate([jnp.repeat(levels[3:], np.array([6, 3, 4]), total_repeat_length=13), jnp.zeros(4)])
-    return params._replace(R=R, Q=Q, P0=gyro_ekf.consistent(params).P0)
+    return gyro_ekf.consistent(params)._replace(R=R, Q=Q)
 
 
 def recorded(seed: int, n: int) -> Flight:
     """Readings, commands and truth of n flights, the gyros healthy, noise and kicks at their true levels."""
     days = drawn(seed, np.zeros(n, int))
     days = days._replace(**{name: np.full(n, value) for name, value in TRUE_STD.items()})
-    return flights(filter_with(PRINTED), trials(np.zeros(6), days, unrest=1.0), seed)
+    return flights(params, trials(np.zeros(6), days, unrest=1.0), seed)
 
 
-def replayed(levels, log: Flight):
+def replayed(aboard: Params, log: Flight):
     """On-board code on recorded readings: negative log-likelihood, NIS, rows, errors of angles and rates.
 
     Shapes (ticks, lanes) and, of the errors, (ticks, 3, lanes). The recorded command is the one the wheels followed.
     """
-    aboard = filter_with(levels)
     n = log.u.shape[-1]
     _, z = jax.vmap(gyro_ekf.init, in_axes=(None, -1), out_axes=-1)(aboard, lanes(Scenario(), n))
 
@@ -431,9 +459,9 @@ def replayed(levels, log: Flight):
 
 
 @jax.jit
-def honesty(log_levels, log: Flight):
-    """Negative log-likelihood and NIS for each measurement, rms errors of angle [rad] and rate [rad/s]; each (lanes,)."""
-    met, error = replayed(jnp.exp(log_levels), log)
+def honesty(aboard: Params, log: Flight):
+    """Negative log-likelihood and NIS for each measurement, rms errors of angle [rad] and rate [rad/s]; (lanes,)."""
+    met, error = replayed(aboard, log)
     rows = jnp.sum(met.rows[FROM:], axis=0)
     rms = lambda part: jnp.sqrt(jnp.mean(jnp.sum(error[FROM:, part] ** 2, axis=1), axis=0))
     return dict(
@@ -448,15 +476,18 @@ def noise_levels(report) -> None:
     """Part 3."""
     n = 32
     to_tune, to_choose = recorded(TUNE, n), recorded(CHOOSE, n)
-    printed = np.log(PRINTED)
     # Neither gain nor estimate changes when P, Q and R are all multiplied by one number; NIS tells which it should be.
-    start = printed + np.log(float(jnp.mean(honesty(printed, to_tune)["nis"])))
-    cost = lambda theta, key: jnp.mean(honesty(theta, to_tune)["nll"])
-    steps = 12 if report.quick else 40
-    optimizer = optax.adam(optax.exponential_decay(1.0, steps, 0.05))
+    start = np.log(PRINTED * float(jnp.mean(honesty(params, to_tune)["nis"])))
+    surprise = lambda theta, log: jnp.mean(honesty(filter_with(jnp.exp(theta)), log)["nll"])
+    cost = lambda theta, key: surprise(theta, to_tune)
+    steps = 20 if report.quick else 40
+    optimizer = optax.adam(optax.linear_schedule(2.0, 0.02, steps), b1=0.7, b2=0.9)
     _, history = tune(cost, start, optimizer, steps, jax.random.key(TUNE), forward=True)
-    judged = [float(jnp.mean(honesty(theta, to_choose)["nll"])) for theta in history.theta]
+    judged = [float(surprise(theta, to_choose)) for theta in history.theta]
     best = history.theta[int(np.argmin(judged))]
+    budget = 60 if report.quick else 400
+    contest(report, descent(history, gradient_price(6)), one_by_one(lambda x: cost(x, None)), start,
+            start - 16, start + 16, budget, "nat per measurement", seeds=range(2))  # fmt: skip
 
     for name, a, b, c in zip(LEVELS, PRINTED, np.exp(best), TRUE):
         report.note(f"{name:8} Table 5 {a:8.3g}, tuned {b:8.3g}, true {c:8.3g}")
@@ -465,21 +496,34 @@ def noise_levels(report) -> None:
                  "levels the readings were made with")  # fmt: skip
 
     batches = [recorded(VERDICT + i, n) for i in range(2 if report.quick else 8)]
-    judge = lambda levels: {
-        k: np.concatenate([np.asarray(honesty(levels, log)[k]) for log in batches]) for k in ("nll", "nis", "angle", "w")
-    }
-    truth = np.log(np.where(known, TRUE, 1e-30))
-    before, after, oracle = judge(printed), judge(best), judge(truth)
+    truth = jnp.where(known, TRUE, 1e-30)
+    before, after, oracle = (
+        jax.tree.map(lambda *a: np.concatenate(a), *(honesty(aboard, log) for log in batches))
+        for aboard in (params, filter_with(np.exp(best)), filter_with(truth))
+    )
     report.note(f"verdict: {len(batches) * n} held-out flights of 80 s; Table 5 -> tuned, then the true levels")
     for name, unit, what in (("nll", 1.0, "NLL for each measurement"), ("nis", 1.0, "NIS for each measurement"),
                              ("angle", DEG, "rms error of angles [deg]"), ("w", DEG, "rms error of rates [deg/s]")):  # fmt: skip
-        report.note(told(what, paired_mean(before[name] / unit, after[name] / unit)) + f"; true levels {oracle[name].mean() / unit:.4g}")
-    report.check("NIS for each measurement, tuned, held-out", 1.0, after["nis"].mean(), 0.02, "a filter that believes what is true")
+        report.note(
+            told(what, paired_mean(before[name] / unit, after[name] / unit))
+            + f"; true levels {oracle[name].mean() / unit:.4g}"
+        )
+    report.check(
+        "NIS for each measurement, tuned, held-out",
+        1.0,
+        after["nis"].mean(),
+        0.02,
+        "a filter that believes what is true",
+    )
     gap = paired_mean(oracle["nll"], after["nll"])
-    report.within("NLL, tuned less that of the true levels, upper end [nat]", None, 0.01, gap.high, "held-out, paired 95 %")
+    report.within(
+        "NLL, tuned less that of the true levels, upper end [nat]", None, 0.01, gap.high, "held-out, paired 95 %"
+    )
     for name, what in (("angle", "angles"), ("w", "rates")):
         ratio = paired_ratio(before[name], after[name])
-        report.within(f"rms error of {what}, tuned / Table 5, upper end", None, 1.0, ratio.high, "held-out, bootstrap 95 %")
+        report.within(
+            f"rms error of {what}, tuned / Table 5, upper end", None, 1.0, ratio.high, "held-out, bootstrap 95 %"
+        )
     levels_figure(report, history, before, after)
 
 
