@@ -49,17 +49,18 @@ def run(report) -> None:
 
 # where the gradient lies
 
-LAWS = {
-    "pseudo-inverse": Params(k_i=0.0),
-    "pseudo-inverse, smooth limit": Params(k_i=0.0, limit=1.0),
-    "robust inverse": Params(k_i=0.0, steering=Steering(lam0=0.01)),
+LAWS = {  # K_I as printed
+    "pseudo-inverse": Params(),
+    "pseudo-inverse, smooth limit": Params(limit=1.0),
+    "robust inverse": Params(steering=Steering(lam0=0.01)),
 }
-STARTS = {  # structure and gimbal angles [deg]: what the pseudo-inverse does from there
-    "smooth": ("pyramid", (45, 45, 45, 45)),
-    "saturated": ("pyramid", (-95, 90, 85, 95)),
-    "bang-bang, pyramid": ("pyramid", (-90, 90, 90, 95)),
-    "bang-bang, box-90": ("box-90", (-90, 90, 90, 95)),
+STARTS = {  # structure and gimbal angles [deg]
+    "pyramid, smooth": ("pyramid", (45, 45, 45, 45)),
+    "pyramid, shaking": ("pyramid", (-95, 90, 85, 95)),
+    "box-90, shaking": ("box-90", (-95, 90, 85, 95)),
+    "box-90, stuck": ("box-90", (-90, 90, 90, 95)),
 }
+SPREAD = 0.05  # [deg] of the gimbal angles around each start; the first of them is the start itself
 HORIZONS = np.array([1, 2, 5, 10, 20, 40, 60])  # [s]
 LITTLE, STEP = 1e-6, 1e-2  # steps in ln K_P: of a central difference, and of a search
 
@@ -90,7 +91,7 @@ def evidence(report) -> None:
     rng = np.random.default_rng(TUNE)
     params, scenarios = [], []
     for structure, gamma in STARTS.values():
-        moved = np.array(gamma) + np.where(np.arange(4) < 3, rng.uniform(-0.5, 0.5, (n, 4)), 0)
+        moved = np.array(gamma) + SPREAD * rng.uniform(-1, 1, (n, 4)) * (np.arange(4) < 3) * (np.arange(n) > 0)[:, None]
         for law in LAWS.values():
             params += [law] * n
             scenarios += [cmg.lost(SKEW[structure], g) for g in moved]
@@ -105,9 +106,7 @@ def evidence(report) -> None:
     little = [(up - down) / (2 * LITTLE) for up, down in zip(at(LITTLE), at(-LITTLE))]
     step = [(up - down) / (2 * STEP) for up, down in zip(at(STEP), at(-STEP))]
 
-    report.note(
-        "median over starts within half a degree, derivative of the 60 s costs by ln K_P, and the share of starts"
-    )
+    report.note("median over starts within 0.05 deg, derivative of the 60 s costs by ln K_P, and the share of starts")
     report.note("where it tells what a step of 1 % in K_P does, to 20 %; rate cost [s], wear [rad/s]")
     honest = []
     for cost in range(2):
@@ -122,13 +121,11 @@ def evidence(report) -> None:
                     f"{name}: gradient {g:9.3g}, difference {d:9.3g}, 1 % step {s:9.3g}, told {honest[cost][-1, i, j].mean():4.0%}"
                 )
             report.note(f"{start:20} {law:30} " + "; ".join(words))
-    smooth = np.abs(gradient[0] / little[0] - 1)[:, 0]
-    report.within(
-        "gradient / central difference - 1, smooth starts", None, 1e-5, smooth.max(), "float64, horizons to 60 s"
-    )
+    error = np.max([np.abs(g / d - 1)[:, 0, :, 0] for g, d in zip(gradient, little)])
+    report.within("gradient / central difference - 1, smooth start", None, 1e-5, error, "float64, both costs, to 60 s")
     m = len(zero) // len(LAWS)
     factors = np.geomspace(0.8, 1.25, m)
-    exact = stacked([cmg.lost(SKEW["pyramid"], STARTS["bang-bang, pyramid"][1])] * len(zero))
+    exact = stacked([cmg.lost(SKEW["pyramid"], STARTS["pyramid, shaking"][1])] * len(zero))
     several = stacked([law for law in LAWS.values() for _ in range(m)])
     terrain = [np.asarray(a)[-1].reshape(-1, m) for a in value(np.tile(np.log(factors), 3), several, exact, ticks)]
     evidence_figure(report, honest, n, factors, terrain)
@@ -151,7 +148,7 @@ def evidence_figure(report, told_right, n: int, factors, terrain) -> None:
         ax.plot(factors, wear, color=COLOURS[1], marker=".", lw=0.8)
         ax.set(xlabel="$K_P$ / the paper's", yscale="log", ylim=(0.5 * terrain[1].min(), 2 * terrain[1].max()))
         ax.grid(alpha=0.3)
-    axes[1, 0].set_ylabel("wear over 60 s from\npyramid [-90, 90, 90, 95] [rad/s]")
+    axes[1, 0].set_ylabel("wear over 60 s from\npyramid [-95, 90, 85, 95] [rad/s]")
     report.figure("where_the_gradient_lies", fig)
 
 
@@ -199,7 +196,7 @@ BEFORE = {
     "as printed": (Params(), np.zeros((2, 3))),
     "K_I = 0": (cmg.table5, np.zeros((2, 3))),
     "K_I = 0, grid rearranged": (cmg.table5, np.radians([[-5.0, 0, -5], [-5, 0, -5]])),
-    "robust inverse, K_I = 0": (LAWS["robust inverse"], np.zeros((2, 3))),
+    "robust inverse": (LAWS["robust inverse"], np.zeros((2, 3))),
 }
 
 
@@ -216,7 +213,7 @@ def tuned(report) -> None:
     cost = lambda theta, key: mean_cost(theta, here)
     _, history = tune(cost, START, OPTIMIZER, steps, KEY, forward=True)
     value = jax.jit(mean_cost)
-    budget = 60 if report.quick else 400
+    budget = 60 if report.quick else 250
     low, high = START - np.repeat([np.log(10), 2.5], [5, 6]), START + np.repeat([np.log(10), 2.5], [5, 6])
     contest(report, descent(history, gradient_price(START.size)), one_by_one(lambda x: value(x, here)), START, low, high,
             budget, "s", seeds=range(2))  # fmt: skip

@@ -485,7 +485,7 @@ def noise_levels(report) -> None:
     _, history = tune(cost, start, optimizer, steps, jax.random.key(TUNE), forward=True)
     judged = [float(surprise(theta, to_choose)) for theta in history.theta]
     best = history.theta[int(np.argmin(judged))]
-    budget = 60 if report.quick else 400
+    budget = 60 if report.quick else 300
     contest(report, descent(history, gradient_price(6)), one_by_one(lambda x: cost(x, None)), start,
             start - 16, start + 16, budget, "nat per measurement", seeds=range(2))  # fmt: skip
 
