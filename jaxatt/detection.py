@@ -147,6 +147,14 @@ def chance(false_alarm, samples):
     return -jnp.expm1(samples * jnp.log1p(-jnp.asarray(false_alarm, float)))
 
 
+def interval(successes: int, trials: int, z: float = 1.959964) -> tuple[float, float]:
+    """Wilson's confidence interval of a share, 95 % by default; z: standard deviations on either side."""
+    p, n = successes / trials, trials
+    centre = (p + z * z / (2 * n)) / (1 + z * z / n)
+    half = z / (1 + z * z / n) * float(np.sqrt(p * (1 - p) / n + z * z / (4 * n * n)))
+    return max(0.0, centre - half), min(1.0, centre + half)
+
+
 def confusion(truth, verdict, causes: int = len(CAUSES)):
     """Counts, shape (causes, causes): row what was wrong, column what was blamed."""
     table = np.zeros((causes, causes), int)

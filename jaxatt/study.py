@@ -11,7 +11,7 @@ from math import prod
 import jax
 import jax.numpy as jnp
 import numpy as np
-from tqdm.auto import tqdm
+from tqdm import tqdm
 
 from jaxatt import check
 from jaxatt.engine import BLOCK, System, admit, block_log, block_scores, compiled, raw_key, traced

@@ -24,6 +24,8 @@ MAY = {
     "campaign": {"check", "engine", "study", "summary"},
     "tuning": {"check", "engine", "study"},
     "objectives": PLAIN | ALGEBRA,
+    "replay": PLAIN | {"faults", "engine"},
+    "plot": PLAIN | ALGEBRA | PARTS,
     "systems": PLAIN | ALGEBRA | PARTS | {"engine"},
 }
 

@@ -316,7 +316,7 @@ def suspect(params: Params, now, board: Board, prior: Belief, y: Readings) -> Su
 
 
 def decide_direct(params: Params, now, board: DirectBoard, y: Readings):
-    """One tick of the computer without a filter: the rate by pseudo-inverse of the gyros in use."""
+    """One tick of the computer without a filter: the rate by pseudo-inverse of the gyros in use. No log."""
 
     def law():
         a, b, c, d = y.gyro.valid
@@ -327,7 +327,7 @@ def decide_direct(params: Params, now, board: DirectBoard, y: Readings):
         w = Vec3(*(sum(row[i] * used[i] for i in range(4)) for row in chosen))
         return command(params, now, y.up, vec3(y.integral), vec3(y.angle.value), w)
 
-    return board._replace(u=every(CONTROL, now, law, board.u))
+    return board._replace(u=every(CONTROL, now, law, board.u)), ()
 
 
 # the two closed loops
@@ -366,7 +366,7 @@ def tick(params: Params, scenario: Scenario, now, x: X, z: Z, noise):
 def tick_direct(params: Params, scenario: Scenario, now, x: X, z: Z, noise):
     """One tick of the loop without a filter."""
     readings = sense(params, scenario, now, x, z, noise)
-    board = decide_direct(params, now, z.board, readings)
+    board, _ = decide_direct(params, now, z.board, readings)
     z = z._replace(readings=readings, board=board, motors=motors(scenario, now))
     return x, z, report(params, now, x, board.u, None)
 

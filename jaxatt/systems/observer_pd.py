@@ -169,10 +169,11 @@ def command(params: Params, board: Board, y: AttitudeRate) -> Vec3:
     return saturated(pd(e.q, e.w, params.k_q, board.k_w), params.u_max)
 
 
-def board_flow(params: Params, board: Board, y: AttitudeRate) -> AttitudeRate:
-    """Rate of change of the on-board continuous state, the observer's estimate (7)."""
+def board_flow(params: Params, board: Board, y: AttitudeRate) -> dict[str, Any]:
+    """Rates of what moves on board between ticks: the observer's estimate (7)."""
     u = command(params, board, y)
-    return mrp_observer(board.estimate, y, u, params.J, board.J_inv, params.alpha, params.beta, params.sign)
+    rate = mrp_observer(board.estimate, y, u, params.J, board.J_inv, params.alpha, params.beta, params.sign)
+    return dict(estimate=rate)
 
 
 def tick(params: Params, scenario: Scenario, now, x: X, z: Z, noise):
@@ -193,7 +194,7 @@ def flow(params: Params, scenario: Scenario, t, x: X, z: Z) -> X:
     return X(
         q=mrp_rate(x.q, x.w),  # eq. (1)
         w=body_acceleration(x.w, u, scenario.J, z.J_inv, scenario.sign),  # eq. (4), sign: spec 5.1
-        estimate=board_flow(params, board, y),
+        **board_flow(params, board, y),
     )
 
 
