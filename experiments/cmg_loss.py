@@ -144,7 +144,7 @@ def geometry(report: Report) -> None:
 def surfaces(report: Report) -> None:
     """Figures 3, 4, 13-16: singular surfaces; figure 5: singular gimbal angles."""
     for name in SKEW:
-        fig = plt.figure(figsize=(12, 8))
+        fig = plt.figure(figsize=(12, 9))
         panels = [(FOUR, 4, (1, 1, 1, 1)), (FOUR, 4, (1, 1, 1, -1)), (FOUR, 4, (1, 1, -1, -1))]
         panels += [(THREE, 3, (1, 1, 1)), (THREE, 3, (1, 1, -1))]
         for i, (group, n, example) in enumerate(panels):
@@ -157,7 +157,7 @@ def surfaces(report: Report) -> None:
             ax.set(xlabel="$h_x / h_w$", ylabel="$h_y / h_w$", zlabel="$h_z / h_w$")
             ax.set_box_aspect((1, 1, 1))
         fig.suptitle(f"Singular momenta, {name}; circles and discs: gimbal axis along the singular direction")
-        fig.tight_layout(w_pad=3)
+        fig.tight_layout(w_pad=3, h_pad=4)
         report.figure(f"figures_3_4_13_16_{name}", fig)
 
     grid = np.radians(3.0) * np.arange(120)
