@@ -34,8 +34,8 @@ def mrp_observer(
     """Rate of change of the nonlinear MRP observer's estimate, Yun & Kang (2020), eq. (7).
 
     y: readings; u: torque [N m]; J: inertia [kg m^2]; alpha [1/s], beta [N m s]: gains; sign: -1 for Euler's
-    equation, +1 for the dynamics as printed (spec, 5.1). Eq. (6) prints S(w) J wh in place of S(wh) J w, for
-    which the Lyapunov identity fails (spec, 5.2).
+    equation, +1 for the dynamics as printed. Eq. (6) prints S(w) J wh in place of S(wh) J w, for which the Lyapunov
+    identity fails. Errata 1 and 2 of docs/loops/observer_pd.md.
     """
     xi_q, xi_w = y.q - estimate.q, y.w - estimate.w
 
@@ -57,7 +57,7 @@ def residual_norm(y: AttitudeRate, estimate: AttitudeRate):
 class LeastSquares(NamedTuple):
     """An estimate of a in y = W a and its gain. Shapes (*lanes)."""
 
-    a: Any  # estimate of the parameter
+    a: Any  # [y / W] estimate of the parameter
     P: Any  # [1/(W^2 s)] gain
 
 
@@ -65,9 +65,9 @@ def least_squares(estimate: LeastSquares, W, y, dt, forget=0.0) -> LeastSquares:
     """The estimate after dt [s] in which the regressor W and the output y were constant.
 
     Eun et al. (2016), eqs. (9), (10): a' = -P W (W a - y), P' = -P W^2 P, here in the rational form that is their
-    exact solution, stable for every dt and never P < 0; forward Euler makes P negative once P W^2 dt > 1 (spec,
-    3.5). forget [1/s]: rate at which old data lose weight; without excitation P then grows without bound, and
-    the caller limits it.
+    exact solution, stable for every dt and never P < 0; forward Euler makes P negative once P W^2 dt > 1
+    (docs/loops/wheel_mrac.md, choice 4). forget [1/s]: rate at which old data lose weight; without excitation P then
+    grows without bound, and the caller limits it.
     """
     P = estimate.P / (jnp.exp(-forget * dt) + estimate.P * W * W * dt)
     return LeastSquares(a=estimate.a - P * W * (W * estimate.a - y) * dt, P=P)
@@ -127,7 +127,8 @@ def ekf_predict(belief: Belief, f: Callable, steady, Q, dt) -> Belief:
 def innovation(belief: Belief, value, h: Callable, R):
     """Residual value - h(mean) and its variance, both (k, *lanes), each measurement for itself.
 
-    h: a linear map that takes components in the leading axis, of a mean and of a covariance alike.
+    h: a linear map that takes components in the leading axis, of a mean and of a covariance alike; R: (k,) or
+    (k, *lanes) variances of the measurements.
     """
     rows = h(belief.cov)
     variance = jax.lax.map(lambda ir: h(ir[1])[ir[0]], (jnp.arange(rows.shape[0]), rows))
@@ -178,7 +179,7 @@ def kalman_update(belief: Belief, y: Reading, h: Callable, R) -> tuple[Belief, E
 def nees(belief: Belief, truth):
     """Normalised estimation error squared e' P^-1 e, shape (*lanes); chi-square with n degrees of freedom.
 
-    It is the NIS of the whole state measured without noise, and needs no solver.
+    truth: the state, (n, *lanes). It is the NIS of the whole state measured without noise, and needs no solver.
     """
     e = jnp.broadcast_to(truth - belief.mean, belief.mean.shape)
     at_zero = Belief(jnp.zeros_like(e), belief.cov)
@@ -201,7 +202,7 @@ class Innovation(NamedTuple):
 
 
 def symmetric(rows):
-    """A symmetric matrix by its upper triangle: what rounding did to the lower one is dropped, and not computed."""
+    """A symmetric matrix, given by rows, by its upper triangle: what rounding did to the lower one is not computed."""
     n = range(len(rows))
     return tuple(tuple(rows[min(i, j)][max(i, j)] for j in n) for i in n)
 
@@ -279,8 +280,8 @@ class AttitudeBias(NamedTuple):
 class Estimate(NamedTuple):
     """A state and its error covariance."""
 
-    x: Any  # n components
-    P: Any  # n rows of n
+    x: Any  # n components of shape (*lanes)
+    P: Any  # n rows of n, shape (*lanes) each
 
 
 def quaternion_step(x: Quat, w: Vec3, w_r: Vec3, dt) -> Quat:
@@ -313,7 +314,7 @@ def noise_moment(law, x, P, Q):
 
     law: 0 second moment of the state, as the LMMSE filter has it, eq. (11); 1 at the estimate and 2 at the
     identity, which make the noise additive; 3 the second moment of the estimate, Q - P, right where the true rate
-    and not the gyro's is given (spec, 7).
+    and not the gyro's is given (docs/loops/star_isolation.md, choice 5).
     """
     xx = outer(x)
 
@@ -334,7 +335,8 @@ def lmmse_predict(e: Moments, w: Vec3, w_r: Vec3, std, dt, law=0.0) -> Moments:
     """Prediction over dt [s] with the gyro's reading w [rad/s] at its start; (11), (13), (15).
 
     w_r: rate of the reference frame; std: standard deviation of the gyro's noise [rad/s] per sample; law: see
-    `noise_moment`. Eq. (14) prints A(k), which must be A(k-1) (spec, 9.1).
+    `noise_moment`. Eq. (14) prints A(k), which must be A(k-1) (docs/loops/star_isolation.md,
+    erratum 1).
     """
     A = lambda x: quaternion_step(Quat(*x), w, w_r, dt)
     W = rate_noise(noise_moment(law, e.x, e.P, e.Q), std, dt)
@@ -354,8 +356,8 @@ def lmmse_update(e: Moments, y: Vec3, s: Vec3, std) -> tuple[Moments, Innovation
 def bias_predict(e: Estimate, w: Vec3, w_r: Vec3, std, walk, dt) -> Estimate:
     """Prediction of `AttitudeBias` over dt [s]: `lmmse_predict` about the reading less the estimated bias.
 
-    walk: standard deviation of the bias's random walk [rad/s/sqrt(s)]. The second moment of the quaternion is
-    taken as P + x x', for with a bias its own recursion is not closed.
+    std: of the gyro's noise [rad/s] per sample; walk: of the bias's random walk [rad/s/sqrt(s)]. The second moment of
+    the quaternion is taken as P + x x', for with a bias its own recursion is not closed.
     """
     x = e.x
     rate = w - x.b
@@ -373,7 +375,7 @@ def bias_predict(e: Estimate, w: Vec3, w_r: Vec3, std, walk, dt) -> Estimate:
 
 
 def bias_update(e: Estimate, y: Vec3, s: Vec3, std) -> tuple[Estimate, Innovation]:
-    """Update of `AttitudeBias` by the reading of a star, as `lmmse_update`."""
+    """Update of `AttitudeBias` by the reading of a star with noise std [1], as `lmmse_update`."""
     C = lambda x: star_map(x, s)
     x, P, innovation = update_three(e.x, e.P, y, C, C(e.x), std * std)
     return Estimate(x, P), innovation
@@ -382,7 +384,7 @@ def bias_update(e: Estimate, y: Vec3, s: Vec3, std) -> tuple[Estimate, Innovatio
 def turn_predict(e: Estimate, w: Vec3, w_r: Vec3, std, dt) -> Estimate:
     """Prediction of a multiplicative EKF: x a unit `Quat`, P of the small turn a in q = x exp(a / 2), 3 rows.
 
-    Exact for rates that are constant over dt: no small angle is assumed.
+    Exact for rates that are constant over dt: no small angle is assumed. std: of the gyro's noise [rad/s] per sample.
     """
     ahead = quat_from_vector(dt * w)
     x = quat_conjugate(quat_from_vector(dt * w_r)) * e.x * ahead
@@ -392,7 +394,10 @@ def turn_predict(e: Estimate, w: Vec3, w_r: Vec3, std, dt) -> Estimate:
 
 
 def turn_update(e: Estimate, y: Vec3, s: Vec3, std) -> tuple[Estimate, Innovation]:
-    """Update of a multiplicative EKF by the reading y of a star in direction s, with the exact residual y - A(x) s."""
+    """Update of a multiplicative EKF by the reading y of a star in direction s, with the exact residual y - A(x) s.
+
+    std: of the noise of each component [1].
+    """
     h = quat_rotate(quat_conjugate(e.x), s)
     o = jnp.zeros_like(e.x.x)
     turn, P, innovation = update_three(Vec3(o, o, o), e.P, y, lambda a: cross(h, Vec3(*a)), h, std * std)

@@ -154,7 +154,7 @@ def value_and_gradient(cost: Callable, theta, key):
 class History(NamedTuple):
     """What `tune` met, step by step; every leaf leads with the steps."""
 
-    theta: Any  # parameters at which the step was taken
+    theta: Any  # (steps, ...) parameters at which the step was taken
     cost: Any  # (steps,) their cost
     gradient: Any  # (steps,) norm of the gradient
     step: Any  # (steps,) [1] factor on the optimizer's update: below 1 after a step that ended in NaN
