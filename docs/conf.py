@@ -1,4 +1,4 @@
-"""The site: ``python -m sphinx -W --keep-going docs docs/_build``. Builds offline; notebooks run once and are cached."""
+"""The site: ``python -m sphinx -W --keep-going docs docs/_build``, offline; notebooks run once and are cached."""
 
 import inspect
 import re
@@ -9,7 +9,7 @@ from docutils.nodes import SkipNode
 from latex2mathml.converter import convert
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-import jaxatt  # noqa: E402
+import jaxatt
 
 project, author, release = "jaxatt", "the jaxatt authors", jaxatt.__version__
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.viewcode"]
