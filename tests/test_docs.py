@@ -64,6 +64,11 @@ def test_fields_say_their_shape_or_unit(name):
             assert said or kind != "Any", f"{label}.{field} says neither shape nor unit nor type"
 
 
+def test_every_module_stands_in_the_reference():
+    pages = "".join(p.read_text() for p in (ROOT / "docs/api").glob("*.md"))
+    assert sorted(re.findall(r"automodule:: (jaxatt\.[\w.]+)", pages)) == MODULES
+
+
 def numbered(page: Path) -> dict[str, set[int]]:
     """The numbers under the headings of a loop's page."""
     parts = re.split(r"^## (.+)$", page.read_text(), flags=re.M)
