@@ -1,4 +1,4 @@
-"""The site: ``python -m sphinx -W --keep-going docs docs/_build``, offline; notebooks run once and are cached."""
+"""The site: ``python -m sphinx -W --keep-going docs docs/_build/html``, offline; notebooks run once and are cached."""
 
 import inspect
 import re
@@ -21,6 +21,7 @@ html_theme = "furo"
 html_title = f"jaxatt {release}"
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
+html_theme_options = {"top_of_page_buttons": []}
 html_math_renderer = "mathml"
 templates_path: list[str] = []
 
@@ -88,8 +89,25 @@ def skip(app, what, name, obj, skipped, options):
     return True if type(obj).__name__ in ("_tuplegetter", "member_descriptor") or name.startswith("_") else None
 
 
+def landmarks(app, exception):
+    """Headings get their level, landmarks their names, and what scrolls sideways the keyboard's focus."""
+    names = {
+        "<pre>": '<pre tabindex="0">',
+        '<div class="table-wrapper': '<div tabindex="0" role="group" aria-label="table" class="table-wrapper',
+        'role="heading">': 'role="heading" aria-level="2">',
+        '<aside class="sidebar-drawer">': '<aside class="sidebar-drawer" aria-label="Site">',
+        '<aside class="toc-drawer">': '<aside class="toc-drawer" aria-label="Page">',
+    }
+    for page in Path(app.outdir).rglob("*.html"):
+        text = page.read_text()
+        for old, new in names.items():
+            text = text.replace(old, new)
+        page.write_text(text)
+
+
 def setup(app):
     app.add_html_math_renderer("mathml", inline_renderers=math("inline"), block_renderers=math("block"))
     app.connect("autodoc-process-docstring", docstring)
     app.connect("autodoc-process-signature", signature)
     app.connect("autodoc-skip-member", skip)
+    app.connect("build-finished", landmarks)
