@@ -19,6 +19,7 @@ suppress_warnings = ["mystnb.unknown_mime_type"]
 
 html_theme = "furo"
 html_title = f"jaxatt {release}"
+html_show_copyright = False
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
 html_theme_options = {"top_of_page_buttons": []}
@@ -30,11 +31,14 @@ myst_heading_anchors = 3
 nb_execution_mode = "cache"
 nb_execution_timeout = 900
 nb_execution_raise_on_error = True
-nb_merge_streams = True
+nb_output_stderr = "remove"  # progress bars
 
 autodoc_member_order = "bysource"
 autodoc_preserve_defaults = True
 autodoc_default_options = {"members": True, "undoc-members": False}
+
+
+BAR = '<mo lspace="0" rspace="0" stretchy="false">|</mo>'  # of a norm, not of a relation
 
 
 def math(display):
@@ -42,7 +46,7 @@ def math(display):
 
     def visit(translator, node):
         latex = node.astext().strip()
-        html = convert(latex, display=display)
+        html = convert(latex, display=display).replace("<mo>&#x0007C;</mo>", BAR).replace("<mo>|</mo>", BAR)
         if display == "block":
             number = f'<span class="eqno">({node["number"]})</span>' if node.get("number") else ""
             ids = "".join(f'<span id="{i}"></span>' for i in node["ids"])
