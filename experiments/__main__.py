@@ -1,4 +1,7 @@
-"""Reproduce the papers: ``python -m experiments [NAME ...] [--quick] [--out DIR]``."""
+"""Reproduce the papers: ``python -m experiments [NAME ...] [--quick] [--out DIR]``.
+
+``python -m experiments NAME campaign --help``: a campaign on disk of one of the loops.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +19,10 @@ NAMES = ("observer_pd", "gyro_ekf", "cmg_loss", "star_isolation", "wheel_mrac")
 
 
 def main() -> int:
+    if sys.argv[2:3] == ["campaign"]:
+        jax.config.update("jax_enable_x64", True)
+        jaxatt.fast_cpu()  # before the loops are imported
+        return importlib.import_module("experiments.campaigns").main(sys.argv[1], sys.argv[3:])
     parser = argparse.ArgumentParser(prog="python -m experiments", description=__doc__)
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(NAMES)}; none for all")
     parser.add_argument("--quick", action="store_true", help="smaller Monte Carlo runs, the same checks")

@@ -324,6 +324,17 @@ def block_log(system: System, ticks: int, params, scenarios, key, block, lane):
     return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:ticks], logs)
 
 
+def block_records(system: System, record: Callable, ticks: int, every: int, params, scenarios, key, block):
+    """record(log) of the ticks 0, every, 2 every, ... of a block: a tree of shape (records, ..., BLOCK)."""
+    noise = partial(_block_noise, system, _block_key(key, block), check.float_type((params, scenarios)))
+
+    def fold(none, now, log):
+        return none, jax.tree.map(lambda a: jnp.broadcast_to(a, _lane_shape(jnp.shape(a))), record(log))
+
+    _, logs = _run(system, params, scenarios, 1, ticks, CHUNK, noise, fold, None)
+    return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:ticks:every], logs)
+
+
 class _Lanes(NamedTuple):
     """z of a `vmapped` system: the user's, and a number whose axes are the lanes."""
 

@@ -39,30 +39,39 @@ def sweep(system: System, params, scenarios, key, *, ticks: int, score: Callable
     blocks = -(-n // BLOCK)
     if traced(params, scenarios, key):
         return _traced(system, score, ticks, params, scenarios, key, n, blocks)
+    with _bar(progress, n, " scenarios") as bar:
+        return scored(system, params, scenarios, key, ticks, score, advance=bar.update)
+
+
+def scored(system, params, scenarios, key, ticks, score, first: int = 0, advance: Callable = lambda n: None):
+    """What `sweep` gives, of admitted input: the blocks first, first + 1, ... on every local device, one host loop.
+
+    advance(n) is called when n more scenarios are done.
+    """
+    n = check.lanes(scenarios)
+    blocks = -(-n // BLOCK)
     rows, layout = _packed(scenarios)
     run = compiled(_packed_scores, 4)
     devices = jax.local_devices()
     at = [jax.device_put((params, key), device) for device in devices]
     under_way: deque = deque()
     done: list = []
-    with _bar(progress, n, " scenarios") as bar:
-        for block in range(blocks + 2 * len(devices)):
-            if block < blocks:
-                params, key = at[block % len(devices)]  # they decide where it runs
-                under_way.append(
-                    run(system, score, ticks, layout, params, key, _lanes_of(rows, block), np.int32(block))
-                )
-            if under_way and block >= 2 * len(devices) - 1:
-                done.append(jax.tree.map(np.asarray, under_way.popleft()))
-                bar.update(min(BLOCK, n - (len(done) - 1) * BLOCK))
+    for block in range(blocks + 2 * len(devices)):
+        if block < blocks:
+            params, key = at[block % len(devices)]  # they decide where it runs
+            number = np.int32(first + block)
+            under_way.append(run(system, score, ticks, layout, params, key, _lanes_of(rows, block), number))
+        if under_way and block >= 2 * len(devices) - 1:
+            done.append(jax.tree.map(np.asarray, under_way.popleft()))
+            advance(min(BLOCK, n - (len(done) - 1) * BLOCK))
     return jax.tree.map(lambda *parts: np.concatenate(parts, axis=-1)[..., :n], *done)
 
 
-def _bar(progress: bool | None, total: int, unit: str):
-    """A progress bar; progress None: on a terminal or in a notebook, and after two seconds."""
+def _bar(progress: bool | None, total: int, unit: str, done: int = 0):
+    """A progress bar of total units, some done before; progress None: on a terminal or in a notebook, after 2 s."""
     seen = sys.stderr.isatty() or "ipykernel" in sys.modules
     hidden = progress is False or (progress is None and not seen)
-    return tqdm(total=total, unit=unit, disable=hidden, delay=0 if progress else 2, leave=False)
+    return tqdm(total=total, unit=unit, initial=done, disable=hidden, delay=0 if progress else 2, leave=False)
 
 
 def _packed_scores(system, score, ticks, layout, params, key, rows, block):
@@ -125,8 +134,13 @@ def rerun(system: System, params, scenarios, key, index: int, *, ticks: int):
     if index >= n:
         check.refuse("index", f"be less than the {n} scenarios", index)
     params, scenarios = admit(system, params, scenarios)
+    here = _lanes_of(jax.tree.map(np.asarray, scenarios), index // BLOCK)
+    return logged(system, params, here, key, index, ticks)
+
+
+def logged(system, params, here, key, index: int, ticks: int):
+    """What `rerun` gives, of admitted input: here are the `BLOCK` scenarios of the block that holds ``index``."""
     block, lane = divmod(index, BLOCK)
-    here = _lanes_of(jax.tree.map(np.asarray, scenarios), block)
     return compiled(block_log, 2)(system, ticks, params, here, raw_key(key), np.int32(block), np.int32(lane))
 
 

@@ -19,6 +19,9 @@ MAY = {
     "engine": {"check", "scores", "vec"},
     "linear": PLAIN | {"engine"},
     "study": {"check", "engine"},
+    "designs": {"check"},
+    "summary": {"check"},
+    "campaign": {"check", "engine", "study", "summary"},
     "systems": PLAIN | ALGEBRA | PARTS | {"engine"},
 }
 
