@@ -654,8 +654,8 @@ def until(path, campaign: Campaign, looks, success: Callable, half_width: float,
     """Run a campaign until the confidence interval of a rate is narrow enough, at the latest to the last look.
 
     looks: growing numbers of scenarios at which the interval is looked at, fixed beforehand; multiples of the
-    block are cheapest. success(dataset) -> bools, one for each scenario; their share is the rate. half_width: of the interval. The error
-    1 - level is shared out equally among the looks (Bonferroni) and each interval is Clopper and Pearson's, so
+    block are cheapest. success(dataset) -> bools, one for each scenario; their share is the rate. half_width: of its
+    interval, at which to stop. The error 1 - level is shared out equally among the looks (Bonferroni) and each interval is Clopper and Pearson's, so
     the interval returned covers the rate with probability of at least level, whenever it stopped. That holds for
     iid scenarios. how: the keywords of `run`, but for shards, which cannot see each other's scenarios.
 

@@ -60,7 +60,7 @@ def test_fields_say_their_shape_or_unit(name):
             (line,) = [line for line in lines if re.match(rf"    {field}: ", line)]
             kind = re.match(r"    \w+: ([^=#]+)", line)[1].strip()
             comment = line.partition("# ")[2]
-            said = re.search(r"\[[^]]+\]|\([^)]*\)|\bbool\b|`\w+`", comment)
+            said = re.search(r"\[[^]]+\]|\([^)]*\)|\bbool\b|`[\w.]+`", comment)
             assert said or kind != "Any", f"{label}.{field} says neither shape nor unit nor type"
 
 
