@@ -1,6 +1,7 @@
 """The site: ``python -m sphinx -W --keep-going docs docs/_build/html``, offline; notebooks run once and are cached."""
 
 import inspect
+import os
 import re
 import sys
 from pathlib import Path
@@ -8,7 +9,10 @@ from pathlib import Path
 from docutils.nodes import SkipNode
 from latex2mathml.converter import convert
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
+ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT))
+os.environ["JAXATT_QUICK"] = "1"  # smaller sweeps in the notebooks
+os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))  # for their kernels
 import jaxatt
 
 project, author, release = "jaxatt", "the jaxatt authors", jaxatt.__version__
