@@ -13,7 +13,7 @@ ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
 os.environ["JAXATT_QUICK"] = "1"  # smaller sweeps in the notebooks
 os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))  # for their kernels
-import jaxatt
+import jaxatt  # noqa: E402
 
 project, author, release = "jaxatt", "the jaxatt authors", jaxatt.__version__
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.viewcode"]
