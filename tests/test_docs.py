@@ -6,6 +6,7 @@ import pkgutil
 import re
 import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -104,8 +105,17 @@ def test_links_lead_somewhere_and_pictures_are_described(page):
         for entry in (line for line in body.splitlines() if line and not line.startswith(":")):
             found = [*page.parent.glob(f"{entry}.md"), *page.parent.glob(f"{entry}.ipynb")]
             assert found, f"{page.name}: {entry}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_commands_name_what_exists(page):
+    text = page.read_text()
+    for name in re.findall(r"python -m ((?:experiments|benchmarks|notebooks)[\w.]*)", text):
+        assert find_spec(name.rstrip(".")), f"{page.name}: {name}"
     for name in re.findall(r"python -m experiments (\w+)", text):
         assert name in (*NAMES, "NAME"), f"{page.name}: no experiment {name}"
+    for name in re.findall(r"pytest (tests/\w+\.py)", text):
+        assert (ROOT / name).exists(), f"{page.name}: {name}"
 
 
 def test_pictures_stay_light():
