@@ -156,5 +156,5 @@ def varied(system: System) -> System:
 
 
 def batch(tree, n: int):
-    """One scenario n times: every leaf, of shape (...), gets the n scenarios as its last axis, (..., n)."""
+    """One scenario, a tree, n times: every leaf, of shape (...), gets the n scenarios as its last axis, (..., n)."""
     return jax.tree.map(lambda leaf: np.broadcast_to(np.asarray(leaf)[..., None], (*np.shape(leaf), n)), tree)

@@ -1,4 +1,4 @@
-"""The loop `star_isolation`: its filters against plain matrices, the spec's numbers, gradients and the door."""
+"""The loop `star_isolation`: its filters against plain matrices, the reference's numbers, gradients and the door."""
 
 import jax
 
@@ -139,7 +139,7 @@ def test_the_steady_state_satisfies_17(run):
     np.testing.assert_allclose(settled, x, atol=1e-12)
 
 
-# the spec's numbers
+# the reference's numbers
 
 
 def test_time_constants(run):
