@@ -14,6 +14,7 @@ import numpy as np
 from jax.scipy.special import gammaincc
 
 from jaxatt import check
+from jaxatt.check import door
 
 NONE, FIRST, SECOND, COMMON = 0, 1, 2, 3  # causes that two residual generators can tell apart
 CAUSES = ("none", "first sensor", "second sensor", "common to both")
@@ -21,6 +22,7 @@ CAUSES = ("none", "first sensor", "second sensor", "common to both")
 # windows and thresholds
 
 
+@door
 def windowed(evaluation, n: int):
     """Sum of the last n values at every time, Yuan et al., eq. (18); fewer where fewer were seen. Shape (T, *lanes).
 
@@ -33,21 +35,25 @@ def windowed(evaluation, n: int):
     return jax.lax.reduce_window(a, 0.0, jax.lax.add, (n, *ones), (1,) * a.ndim, pad)
 
 
+@door
 def threshold_nsigma(n, dof):
     """n^2 dof: every component of the residual n standard deviations off at once. dof = 3 N for N values of J."""
     return n * n * dof
 
 
+@door
 def threshold_moment(n, dof):
     """dof + n sqrt(2 dof): the mean of a chi-square number and n of its standard deviations."""
     return dof + n * jnp.sqrt(2.0 * dof)
 
 
+@door
 def threshold_mean(n, dof):
     """n dof: n times the mean of a chi-square number."""
     return n * dof
 
 
+@door
 def threshold_quantile(false_alarm, dof):
     """The value that a chi-square number of dof degrees of freedom exceeds with probability false_alarm.
 
@@ -71,11 +77,13 @@ def threshold_quantile(false_alarm, dof):
 # alarms and causes
 
 
+@door
 def alarm(evaluation, threshold):
     """Whether the evaluation exceeds its threshold; NaN alarms."""
     return ~(evaluation <= threshold)
 
 
+@door
 def isolate(first, second):
     """The cause that the alarms of two residual generators point to, eq. (20): one of `NONE` ... `COMMON`.
 
@@ -84,6 +92,7 @@ def isolate(first, second):
     return jnp.where(first & second, COMMON, jnp.where(first, FIRST, jnp.where(second, SECOND, NONE)))
 
 
+@door
 def isolate_first(first, second, patience):
     """The cause from the times [s] of first alarm, inf for never, when the verdict waits patience [s] for the other."""
     seen = jnp.minimum(first, second)
@@ -101,6 +110,7 @@ class Roc(NamedTuple):
     detection: Any  # [1] share of faulty values above it
 
 
+@door
 def roc(healthy, faulty, thresholds=None) -> Roc:
     """The ROC curve of values of an evaluation with and without fault, each flattened.
 
@@ -115,6 +125,7 @@ def roc(healthy, faulty, thresholds=None) -> Roc:
     return Roc(at, above(healthy), above(faulty))
 
 
+@door
 def detection_at(healthy, faulty, false_alarm) -> float:
     """The detection rate at the lowest threshold whose false-alarm rate does not exceed false_alarm."""
     healthy = np.sort(np.ravel(healthy))
@@ -123,6 +134,7 @@ def detection_at(healthy, faulty, false_alarm) -> float:
     return float(np.mean(np.ravel(faulty) > threshold))
 
 
+@door
 def area(curve: Roc) -> float:
     """Area under a ROC curve: the probability that a faulty value exceeds a healthy one."""
     x = np.concatenate([[0], curve.false_alarm, [1]])
@@ -130,23 +142,27 @@ def area(curve: Roc) -> float:
     return float(np.sum(np.diff(x) * (y[1:] + y[:-1]) / 2))
 
 
+@door
 def first_alarm(alarms, t, since=0.0):
     """Time [s] from since to the first alarm not before it, inf if never: shape (*lanes) from alarms (T, *lanes)."""
     t = jnp.asarray(t).reshape(-1, *(1,) * (jnp.ndim(alarms) - 1))
     return jnp.min(jnp.where(alarms & (t >= since), t - since, jnp.inf), axis=0)
 
 
+@door
 def detected_by(delays, times):
     """Share of runs detected within each of the times [s]: the distribution of the delay; never is inf."""
     delays = np.sort(np.ravel(delays))
     return np.searchsorted(delays, np.asarray(times), side="right") / len(delays)
 
 
+@door
 def chance(false_alarm, samples):
     """Probability of at least one alarm in so many independent healthy samples: what a detection is worth against."""
     return -jnp.expm1(samples * jnp.log1p(-jnp.asarray(false_alarm, float)))
 
 
+@door
 def confusion(truth, verdict, causes: int = len(CAUSES)):
     """Counts, shape (causes, causes): row what was wrong, column what was blamed."""
     table = np.zeros((causes, causes), int)
@@ -157,6 +173,7 @@ def confusion(truth, verdict, causes: int = len(CAUSES)):
 # smooth surrogates, for gradients in thresholds, windows and gains
 
 
+@door
 def soft_windowed(evaluation, n, longest: int):
     """`windowed` with a window of real length n in [1, longest]: its oldest value counts in part. Shape (T, *lanes)."""
     a = jnp.asarray(evaluation)
@@ -165,11 +182,13 @@ def soft_windowed(evaluation, n, longest: int):
     return sum(weights[i] * padded[longest - 1 - i : longest - 1 - i + len(a)] for i in range(longest))
 
 
+@door
 def soft_alarm(evaluation, threshold, temperature):
     """A probability of alarm in place of a step at the threshold; the step is its limit for temperature -> 0."""
     return jax.nn.sigmoid((evaluation - threshold) / temperature)
 
 
+@door
 def soft_delay(probability, dt):
     """Expected time [s] to the first alarm, sum_k prod_{j<k} (1 - p_j) dt; at most T dt. Shape (*lanes)."""
     silent = jnp.cumprod(1 - probability, axis=0)
@@ -179,16 +198,19 @@ def soft_delay(probability, dt):
 # chi-square of the innovation, channel by channel
 
 
+@door
 def smoothed(mean, value, memory):
     """The moving mean of normalised innovations after one more; memory in (0, 1], 1 for no memory."""
     return mean + memory * (value - mean)
 
 
+@door
 def chi_square(mean, memory):
     """Square of a `smoothed` mean of unit white noise over its variance: chi-square with one degree of freedom."""
     return mean * mean * (2 - memory) / memory
 
 
+@door
 def worst_above(statistic, threshold):
     """Which channel, at most one, has the largest statistic and that above the threshold; (n, *lanes) bool."""
     largest = jnp.max(statistic, axis=0)

@@ -8,6 +8,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from jaxatt import check
+from jaxatt.check import door
 from jaxatt.engine import System, _start, _step, admit
 
 
@@ -40,6 +41,7 @@ def sampled(system: System, params, scenario, *, ticks: int, states: tuple[str, 
     return jax.jacfwd(run)(flat)
 
 
+@door
 def growth_rates(matrix, period: float) -> np.ndarray:
     """Growth rates log|z| / period [1/s] of a sampled loop's modes, largest first, shape (..., n).
 
@@ -50,6 +52,7 @@ def growth_rates(matrix, period: float) -> np.ndarray:
         return -np.sort(-np.log(size) / period, axis=-1)
 
 
+@door
 def observability_rank(A, H, scale, *, duration: float, samples: int = 50, tol: float = 1e-8) -> int:
     """How many directions of the state of x' = A x, A (n, n), the readings y = H x, H (m, n), tell apart.
 

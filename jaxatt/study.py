@@ -17,7 +17,7 @@ from jax.flatten_util import ravel_pytree
 from tqdm.auto import tqdm
 
 from jaxatt import check
-from jaxatt.engine import BLOCK, System, admit, block_log, block_scores, compiled, raw_key, traced
+from jaxatt.engine import BLOCK, System, admit, block_log, block_scores, compiled, one_key, traced, tree_bytes
 
 
 def sweep(system: System, params, scenarios, key, *, ticks: int, score: Callable, progress: bool | None = None):
@@ -34,8 +34,9 @@ def sweep(system: System, params, scenarios, key, *, ticks: int, score: Callable
     for what is no number or no key.
     """
     ticks, n = check.whole("ticks", ticks), check.lanes(scenarios)
-    params, scenarios = admit(system, params, scenarios)
-    key = raw_key(key)
+    check.function("score", score)
+    params, scenarios = admit(system, params, scenarios, (n,))
+    key = one_key(key)
     blocks = -(-n // BLOCK)
     if traced(params, scenarios, key):
         return _traced(system, score, ticks, params, scenarios, key, n, blocks)
@@ -124,10 +125,13 @@ def rerun(system: System, params, scenarios, key, index: int, *, ticks: int):
     index = check.whole("index", index, 0)
     if index >= n:
         check.refuse("index", f"be less than the {n} scenarios", index)
-    params, scenarios = admit(system, params, scenarios)
+    params, scenarios = admit(system, params, scenarios, (n,))
     block, lane = divmod(index, BLOCK)
     here = _lanes_of(jax.tree.map(np.asarray, scenarios), block)
-    return compiled(block_log, 2)(system, ticks, params, here, raw_key(key), np.int32(block), np.int32(lane))
+    operands = params, here, one_key(key), np.int32(block), np.int32(lane)
+    run = compiled(block_log, 2)
+    check.fits_memory(f"`ticks` = {ticks}", tree_bytes(run.eval_shape(system, ticks, *operands)), "ask for fewer")
+    return run(system, ticks, *operands)
 
 
 FEW = 6  # numbers up to which forward mode is the cheaper

@@ -223,8 +223,10 @@ def score(params: Params, scenario: Scenario, now, log: Log) -> Scores:
     )
 
 
-def refuse_bad(params: Params, scenario: Scenario) -> None:
-    """The system's check: ValueError on input outside the paper's and physics' domain."""
+def refuse_bad(params: Params, scenario: Scenario) -> tuple:
+    """The system's check: ValueError on input outside the paper's and physics' domain; returns the lanes."""
+    check.lanes_of("params", params, Params())
+    lanes = check.lanes_of("scenario", scenario, Scenario())
     moments = check.moments("params.J", params.J)
     for name in ("alpha", "beta", "sigma", "k_q", "k_w0"):
         check.positive(f"params.{name}", getattr(params, name))
@@ -244,6 +246,7 @@ def refuse_bad(params: Params, scenario: Scenario) -> None:
     for name in ("star", "gyro"):
         for axis, fault in getattr(scenario, name)._asdict().items():
             check_fault(f"scenario.{name}.{axis}", fault)
+    return lanes
 
 
 system = System(init, tick, flow, dt=DT, substeps=4, normals=6, check=refuse_bad)
