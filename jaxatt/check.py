@@ -205,6 +205,14 @@ def kind(name: str, value, wanted: type) -> None:
         raise TypeError(f"`{name}` must be a {wanted.__name__}, but it is {short(value)}.")
 
 
+def shapes(params, scenario, params_like, scenario_like) -> tuple:
+    """The lanes of a scenario: `lanes_of` both, where params carry none or, in a design study, the scenario's."""
+    lanes, its = lanes_of("scenario", scenario, scenario_like), lanes_of("params", params, params_like)
+    if its not in ((), lanes):
+        refuse("params", f"carry no lanes, or the scenario's, {lanes}", its)
+    return lanes
+
+
 def lanes_of(name: str, tree, example) -> tuple:
     """The lanes that the leaves of a tree carry behind the shapes of the example's: the same for all of them.
 

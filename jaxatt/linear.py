@@ -23,13 +23,12 @@ def sampled(system: System, params, scenario, *, ticks: int, states: tuple[str, 
     Raises ValueError on ticks < 1 and for a state that x does not have.
     """
     ticks = check.whole("ticks", ticks)
-    params, scenario = admit(system, params, scenario)
+    params, scenario = admit(system, params, scenario, ())
     x0, z0 = _start(system, params, scenario, 0)
     x0 = x0 if start is None else start
     names = x0._fields if states is None else states
-    for name in names:
-        if name not in x0._fields:
-            check.refuse("states", f"be of {x0._fields}", repr(name))
+    if not isinstance(names, tuple) or not names or not set(names) <= set(x0._fields):
+        check.refuse("states", f"be a tuple of {x0._fields}", check.short(names))
     flat, unravel = ravel_pytree({name: getattr(x0, name) for name in names})
     noise = jnp.zeros(system.normals, flat.dtype)
 

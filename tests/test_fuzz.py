@@ -4,8 +4,6 @@
 refused by our own code, with no word from inside JAX, and the verbs refuse before anything is compiled.
 """
 
-import dataclasses
-import importlib
 import inspect
 import os
 import re
@@ -163,7 +161,7 @@ def argument(f, name, note):
         return whole
     if f.__module__ != "jaxatt.singularity" and name == "t":
         return plain()
-    return by_kind.get(note) or by_name.get(name) or plain()
+    return by_kind.get(note, by_name.get(name, plain()))
 
 
 @pytest.mark.parametrize("f", PARTS, ids=lambda f: f"{f.__module__.split('.')[1]}.{f.__name__}")
@@ -199,9 +197,9 @@ class X(NamedTuple):
 
 
 def refuse_bad(params, scenario):
-    check.lanes_of("params", params, Params())
+    lanes = check.shapes(params, scenario, Params(), Scenario())
     check.finite("params", params)
-    return check.lanes_of("scenario", scenario, Scenario())
+    return lanes
 
 
 LOOP = System(

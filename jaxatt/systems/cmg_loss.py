@@ -258,8 +258,7 @@ def classify(run: Scores):
 
 def refuse_bad(params: Params, scenario: Scenario) -> tuple:
     """The system's check: ValueError on input outside physics' domain; returns the lanes."""
-    check.lanes_of("params", params, Params())
-    lanes = check.lanes_of("scenario", scenario, _shaped(scenario))
+    lanes = check.shapes(params, scenario, Params(), _shaped(scenario))
     check.moments("params.J", params.J)
     check.moments("scenario.J", scenario.J)
     for name in ("k_p", "k_i"):

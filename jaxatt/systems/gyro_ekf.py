@@ -453,8 +453,7 @@ def consistent(params: Params) -> Params:
 
 def refuse_bad(params: Params, scenario: Scenario) -> tuple:
     """The system's check: ValueError on input outside physics; returns the lanes."""
-    check.lanes_of("params", params, Params())
-    lanes = check.lanes_of("scenario", scenario, Scenario()._replace(gyro=None, wheel=None))
+    lanes = check.shapes(params, scenario, Params(), Scenario()._replace(gyro=None, wheel=None))
     for name in ("gyro", "wheel"):  # one number for all four, or four
         fault = getattr(scenario, name)
         check.kind(f"scenario.{name}", fault, Fault)

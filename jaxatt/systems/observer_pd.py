@@ -225,8 +225,7 @@ def score(params: Params, scenario: Scenario, now, log: Log) -> Scores:
 
 def refuse_bad(params: Params, scenario: Scenario) -> tuple:
     """The system's check: ValueError on input outside the paper's and physics' domain; returns the lanes."""
-    check.lanes_of("params", params, Params())
-    lanes = check.lanes_of("scenario", scenario, Scenario())
+    lanes = check.shapes(params, scenario, Params(), Scenario())
     moments = check.moments("params.J", params.J)
     for name in ("alpha", "beta", "sigma", "k_q", "k_w0"):
         check.positive(f"params.{name}", getattr(params, name))

@@ -468,8 +468,7 @@ def refuse_bad(generator: Generator, params: Params, scenario: Scenario) -> tupl
 
     Returns the lanes.
     """
-    check.lanes_of("params", params, Params())
-    lanes = check.lanes_of("scenario", scenario, Scenario())
+    lanes = check.shapes(params, scenario, Params(), Scenario())
     for name in ("std_gyro", "std_star", "std_q0", "std_qv", "std_bias", "threshold", "angle_threshold"):
         check.positive(f"params.{name}", getattr(params, name))
     for name in ("bandwidth", "damping", "u_max"):

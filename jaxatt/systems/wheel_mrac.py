@@ -386,8 +386,7 @@ def normals_of(v, amplitude):
 
 def refuse_bad(params: Params, scenario: Scenario) -> tuple:
     """The system's check: ValueError on input outside physics' domain; returns the lanes."""
-    check.lanes_of("params", params, Params())
-    lanes = check.lanes_of("scenario", scenario, Scenario())
+    lanes = check.shapes(params, scenario, Params(), Scenario())
     for name in ("duration", "K", "J_w", "J_hat", "a_m", "P0", "residual_max"):
         check.positive(f"params.{name}", getattr(params, name))
     for name in ("turn", "forward", "b_m", "a_r", "a_y", "blend"):
