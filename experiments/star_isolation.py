@@ -18,7 +18,8 @@ import optax
 
 from experiments.report import Report, interval, plt
 from jaxatt import Fault, Quat, Vec3, detection, scores, simulate, sweep, tune
-from jaxatt.estimators import lmmse_predict, lmmse_start, lmmse_update
+from jaxatt.lmmse import lmmse_predict, lmmse_start, lmmse_update
+from jaxatt.study import batch
 from jaxatt.systems.star_isolation import (
     ARCSEC,
     DEG,
@@ -69,14 +70,9 @@ def run(report: Report) -> None:
 # scenarios
 
 
-def spread(one: Scenario, n: int) -> Scenario:
-    """The same scenario n times."""
-    return jax.tree.map(lambda a: np.broadcast_to(np.asarray(a, float)[..., None], (*np.shape(a), n)), one)
-
-
 def drawn(n: int, seed: int, one: Scenario = healthy) -> Scenario:
     """n scenarios whose initial estimates err as the prior says, but for the scalar part, which is the true one."""
-    many = spread(one, n)
+    many = batch(one, n)
     errors = params.std_qv * np.random.default_rng(seed).standard_normal((3, 2, n))
     pair = lambda a: np.broadcast_to(a, (2, n))
     return many._replace(q_hat=Quat(pair(many.q.w), *(pair(a) + e for a, e in zip(many.q.v, errors))))
@@ -422,7 +418,7 @@ def options(report: Report) -> None:
     )
     for own in (ROLL, PITCH):
         star = on_sensor(own, tangential(own, Fault(onset=100.0, bias=100 * ARCSEC)))
-        out = swept(many._replace(star=spread(scenario._replace(star=star), n).star), 14, seven)["main"]
+        out = swept(many._replace(star=batch(scenario._replace(star=star), n).star), 14, seven)["main"]
         report.check(
             f"7 states, {NAMES[own]} 100 arcsec: share blamed rightly",
             1.0,
@@ -641,7 +637,7 @@ def _map(s: np.ndarray) -> np.ndarray:
 def likelihood(theta, readings):
     """Mean negative log likelihood of the innovations of both filters, theta = log (sg, ss) believed / true."""
     p = params._replace(std_gyro=params.std_gyro * jnp.exp(theta["gyro"]), std_star=STD * jnp.exp(theta["star"]))
-    of = replay(LMMSE, p, spread(healthy, readings.gyro.x.shape[1]).q_hat, readings)
+    of = replay(LMMSE, p, batch(healthy, readings.gyro.x.shape[1]).q_hat, readings)
     return 0.5 * jnp.mean(of.log_det + of.nis)
 
 

@@ -226,5 +226,5 @@ def varied(system: System) -> System:
 
 
 def batch(tree, n: int):
-    """The tree with n scenarios in the last axis of every leaf that carries none, leaves of shape () or (n,)."""
-    return jax.tree.map(lambda leaf: np.broadcast_to(np.asarray(leaf), (n,)), tree)
+    """One scenario n times: every leaf, of shape (...), gets the n scenarios as its last axis, (..., n)."""
+    return jax.tree.map(lambda leaf: np.broadcast_to(np.asarray(leaf)[..., None], (*np.shape(leaf), n)), tree)

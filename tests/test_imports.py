@@ -10,7 +10,7 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "jaxatt"
 PLAIN = {"vec", "check"}
 ALGEBRA = {"attitude", "faults", "mounting", "scores"}
-PARTS = {"bodies", "sensors", "estimators", "controllers", "detection", "singularity"}
+PARTS = {"bodies", "sensors", "estimators", "kalman", "lmmse", "controllers", "detection", "singularity"}
 MAY = {
     "check": set(),
     "vec": {"check"},

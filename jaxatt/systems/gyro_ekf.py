@@ -21,8 +21,8 @@ from jaxatt.bodies import wheel_rate, wheeled_acceleration
 from jaxatt.controllers import allocation, pid
 from jaxatt.detection import chi_square, smoothed, worst_above
 from jaxatt.engine import System, every
-from jaxatt.estimators import Belief, ekf_predict, innovation, kalman_update, nees
 from jaxatt.faults import Channel, Fault, Reading, active, channel, check_fault, dead, read
+from jaxatt.kalman import Belief, ekf_predict, innovation, kalman_update, nees
 from jaxatt.mounting import along, gyro_pyramid, parity_vector, total, wheel_pyramid
 from jaxatt.vec import Mat3, Vec3, array, inverse, vec3
 

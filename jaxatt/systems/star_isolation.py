@@ -24,7 +24,8 @@ from jaxatt.bodies import body_acceleration, gravity_gradient
 from jaxatt.controllers import quaternion_pd, saturated
 from jaxatt.detection import alarm, isolate
 from jaxatt.engine import System
-from jaxatt.estimators import (
+from jaxatt.faults import Fault, any_active, check_fault, first_onset, on_axes
+from jaxatt.lmmse import (
     AttitudeBias,
     Estimate,
     Innovation,
@@ -36,7 +37,6 @@ from jaxatt.estimators import (
     turn_predict,
     turn_update,
 )
-from jaxatt.faults import Fault, any_active, check_fault, first_onset, on_axes
 from jaxatt.sensors import read_triad, triad
 from jaxatt.vec import Mat3, Quat, Vec3, cross, diagonal, inverse, norm, once
 
