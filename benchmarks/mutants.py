@@ -33,7 +33,7 @@ from tqdm import tqdm
 
 ROOT = Path(__file__).parents[1]
 PHYSICS = (
-    "attitude", "bodies", "controllers", "detection", "estimators", "faults", "kalman", "linear", "mounting", "sensors",
+    "attitude", "bodies", "controllers", "detection", "estimators", "faults", "kalman", "linear", "lmmse", "mounting", "sensors",
     "singularity", "vec", "systems/cmg_loss", "systems/gyro_ekf", "systems/observer_pd", "systems/star_isolation",
     "systems/wheel_mrac",
 )  # fmt: skip

@@ -227,4 +227,11 @@ def varied(system: System) -> System:
 
 def batch(tree, n: int):
     """One scenario n times: every leaf, of shape (...), gets the n scenarios as its last axis, (..., n)."""
-    return jax.tree.map(lambda leaf: np.broadcast_to(np.asarray(leaf)[..., None], (*np.shape(leaf), n)), tree)
+    n = check.whole("n", n)
+
+    def repeated(leaf):
+        if not check.is_number(leaf):
+            raise TypeError(f"`tree` must hold numbers, but it holds {check.short(leaf)}.")
+        return np.broadcast_to(np.asarray(leaf)[..., None], (*np.shape(leaf), n))
+
+    return jax.tree.map(repeated, tree)

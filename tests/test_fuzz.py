@@ -15,14 +15,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import jaxatt
 from jaxatt import attitude, check, detection, faults, linear, mounting, scores, singularity, vec
-from jaxatt.engine import Now, System, admit, noise_of, rk4, simulate, vmapped
+from jaxatt.engine import Now, System, admit, noise_of, simulate, vmapped
 from jaxatt.faults import Fault
 from jaxatt.mounting import GimbalAxes, cmg_axes
 from jaxatt.study import batch, rerun, sweep, varied
@@ -374,7 +373,9 @@ def test_ten_million_ticks_with_a_full_log_are_refused_with_the_way_out(monkeypa
     scenario = batch(observer_pd.scenario, 1000)
     run = lambda every: simulate(observer_pd.system, observer_pd.params, scenario, many, ticks=10_000_000, every=every)
     before = len(compiled)
-    with pytest.raises(ValueError, match=r"`ticks` = 10000000 with `every` = 1 takes .* TB|GB.*keep fewer records, by `every`"):
+    with pytest.raises(
+        ValueError, match=r"`ticks` = 10000000 with `every` = 1 takes .* TB|GB.*keep fewer records, by `every`"
+    ):
         run(1)
     monkeypatch.setattr(check, "free_memory", lambda: 2e6)
     with pytest.raises(ValueError, match=r"`ticks` = 300000 takes .* GB, but 0.002 GB of memory are free"):
