@@ -14,7 +14,7 @@ import numpy as np
 from tqdm import tqdm
 
 from jaxatt import check
-from jaxatt.engine import BLOCK, System, admit, block_log, block_scores, compiled, raw_key, traced
+from jaxatt.engine import BLOCK, System, admit, block_log, block_scores, compiled, one_key, traced, tree_bytes
 
 
 def sweep(system: System, params, scenarios, key, *, ticks: int, score: Callable, progress: bool | None = None):
@@ -31,8 +31,9 @@ def sweep(system: System, params, scenarios, key, *, ticks: int, score: Callable
     for what is no number or no key.
     """
     ticks, n = check.whole("ticks", ticks), check.lanes(scenarios)
-    params, scenarios = admit(system, params, scenarios)
-    key = raw_key(key)
+    check.function("score", score)
+    params, scenarios = admit(system, params, scenarios, (n,))
+    key = one_key(key)
     blocks = -(-n // BLOCK)
     if traced(params, scenarios, key):
         return _traced(system, score, ticks, params, scenarios, key, n, blocks)
@@ -130,15 +131,18 @@ def rerun(system: System, params, scenarios, key, index: int, *, ticks: int):
     index = check.whole("index", index, 0)
     if index >= n:
         check.refuse("index", f"be less than the {n} scenarios", index)
-    params, scenarios = admit(system, params, scenarios)
+    params, scenarios = admit(system, params, scenarios, (n,))
     here = _lanes_of(jax.tree.map(np.asarray, scenarios), index // BLOCK)
-    return logged(system, params, here, key, index, ticks)
+    return logged(system, params, here, one_key(key), index, ticks)
 
 
 def logged(system, params, here, key, index: int, ticks: int):
     """What `rerun` gives, of admitted input: here are the `BLOCK` scenarios of the block that holds ``index``."""
     block, lane = divmod(index, BLOCK)
-    return compiled(block_log, 2)(system, ticks, params, here, raw_key(key), np.int32(block), np.int32(lane))
+    operands = params, here, key, np.int32(block), np.int32(lane)
+    run = compiled(block_log, 2)
+    check.fits_memory(f"`ticks` = {ticks}", tree_bytes(run.eval_shape(system, ticks, *operands)), "ask for fewer")
+    return run(system, ticks, *operands)
 
 
 @lru_cache
@@ -157,4 +161,11 @@ def varied(system: System) -> System:
 
 def batch(tree, n: int):
     """One scenario, a tree, n times: every leaf, of shape (...), gets the n scenarios as its last axis, (..., n)."""
-    return jax.tree.map(lambda leaf: np.broadcast_to(np.asarray(leaf)[..., None], (*np.shape(leaf), n)), tree)
+    n = check.whole("n", n)
+
+    def repeated(leaf):
+        if not check.is_number(leaf):
+            raise TypeError(f"`tree` must hold numbers, but it holds {check.short(leaf)}.")
+        return np.broadcast_to(np.asarray(leaf)[..., None], (*np.shape(leaf), n))
+
+    return jax.tree.map(repeated, tree)

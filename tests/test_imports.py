@@ -12,7 +12,8 @@ PLAIN = {"vec", "check"}
 ALGEBRA = {"attitude", "faults", "mounting", "scores"}
 PARTS = {"bodies", "sensors", "estimators", "kalman", "lmmse", "controllers", "detection", "singularity"}
 MAY = {
-    **{name: set() for name in PLAIN},
+    "check": set(),
+    "vec": {"check"},
     **{name: PLAIN for name in ALGEBRA},
     **{name: PLAIN | ALGEBRA for name in PARTS},
     "controllers": PLAIN | ALGEBRA | {"singularity"},

@@ -266,8 +266,9 @@ def classify(run: Scores):
     return np.where(~(variation <= 20), FLUCTUATION, np.where(ratio > 0.2, LOCK, PROPER))
 
 
-def refuse_bad(params: Params, scenario: Scenario) -> None:
-    """The system's check: ValueError on input outside physics' domain."""
+def refuse_bad(params: Params, scenario: Scenario) -> tuple:
+    """The system's check: ValueError on input outside physics' domain; returns the lanes."""
+    lanes = check.shapes(params, scenario, Params(), _shaped(scenario))
     check.moments("params.J", params.J)
     check.moments("scenario.J", scenario.J)
     for name in ("k_p", "k_i"):
@@ -292,6 +293,19 @@ def refuse_bad(params: Params, scenario: Scenario) -> None:
         check_gimbal_axes("scenario.axes", scenario.axes, np.isinf(np.asarray(scenario.failure.onset)))
         if scenario.known is not None:
             check_gimbal_axes("scenario.known", scenario.known)
+    return lanes
+
+
+def _shaped(scenario: Scenario) -> Scenario:
+    """A scenario of the shapes that this one must have, for as many modules as it has gimbal angles."""
+    check.kind("scenario", scenario, Scenario)
+    n = np.shape(scenario.gamma)[:1]
+    if not n:
+        check.refuse("scenario.gamma", "have shape (n, *lanes)", "()")
+    each = np.zeros(n)
+    axes = GimbalAxes(Vec3(each, each, each), Vec3(each, each, each))
+    known = None if scenario.known is None else axes
+    return Scenario(each, Failure(each, each, each, each), axes, known, each, each)
 
 
 def lost(skew, gamma, module: int = 3, onset=0.0, brake=1e-6, free=0.0, friction=0.0) -> Scenario:

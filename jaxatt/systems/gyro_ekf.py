@@ -451,8 +451,16 @@ def consistent(params: Params) -> Params:
     return params._replace(R=R, Q=1e-8 * np.asarray(Params().Q), P0=P0)
 
 
-def refuse_bad(params: Params, scenario: Scenario) -> None:
-    """The system's check: ValueError on input outside physics."""
+def refuse_bad(params: Params, scenario: Scenario) -> tuple:
+    """The system's check: ValueError on input outside physics; returns the lanes."""
+    lanes = check.shapes(params, scenario, Params(), Scenario()._replace(gyro=None, wheel=None))
+    for name in ("gyro", "wheel"):  # one number for all four, or four
+        fault = getattr(scenario, name)
+        check.kind(f"scenario.{name}", fault, Fault)
+        shaped = Fault(*(np.zeros(4) if np.ndim(a) > len(lanes) else 0.0 for a in fault))
+        its = check.lanes_of(f"scenario.{name}", fault, shaped)
+        if its != lanes:
+            check.refuse(f"scenario.{name}", f"carry the lanes of the others, {lanes}", its)
     check.moments("params.J", params.J)
     check.moments("scenario.J", scenario.J)
     for name in ("k_f", "k_p", "k_i", "k_d", "slew"):
@@ -486,6 +494,7 @@ def refuse_bad(params: Params, scenario: Scenario) -> None:
         check.one_of(f"scenario.{name}", getattr(scenario, name), (0, 1))
     for name in ("gyro", "wheel", "sun", "earth"):
         check_fault(f"scenario.{name}", getattr(scenario, name))
+    return lanes
 
 
 system = System(init, tick, flow, dt=DT, normals=11, check=refuse_bad)

@@ -251,8 +251,9 @@ def margins(params: Params, lambda_max, e_q=0.0, e_w=0.0) -> Margins:
     )
 
 
-def refuse_bad(params: Params, scenario: Scenario) -> None:
-    """The system's check: ValueError on input outside the paper's and physics' domain."""
+def refuse_bad(params: Params, scenario: Scenario) -> tuple:
+    """The system's check: ValueError on input outside the paper's and physics' domain; returns the lanes."""
+    lanes = check.shapes(params, scenario, Params(), Scenario())
     moments = check.moments("params.J", params.J)
     for name in ("alpha", "beta", "sigma", "k_q", "k_w0"):
         check.positive(f"params.{name}", getattr(params, name))
@@ -272,6 +273,7 @@ def refuse_bad(params: Params, scenario: Scenario) -> None:
     for name in ("star", "gyro"):
         for axis, fault in getattr(scenario, name)._asdict().items():
             check_fault(f"scenario.{name}.{axis}", fault)
+    return lanes
 
 
 system = System(init, tick, flow, dt=DT, substeps=4, normals=6, check=refuse_bad)

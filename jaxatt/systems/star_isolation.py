@@ -452,8 +452,12 @@ def _within_range(name: str, q: Quat) -> None:
             )
 
 
-def refuse_bad(generator: Generator, params: Params, scenario: Scenario) -> None:
-    """The system's check: ValueError on bad input, a warning for pointing beyond the filter's linear range."""
+def refuse_bad(generator: Generator, params: Params, scenario: Scenario) -> tuple:
+    """The system's check: ValueError on bad input, a warning for pointing beyond the filter's linear range.
+
+    Returns the lanes.
+    """
+    lanes = check.shapes(params, scenario, Params(), Scenario())
     for name in ("std_gyro", "std_star", "std_q0", "std_qv", "std_bias", "threshold", "angle_threshold"):
         check.positive(f"params.{name}", getattr(params, name))
     for name in ("bandwidth", "damping", "u_max"):
@@ -480,6 +484,7 @@ def refuse_bad(generator: Generator, params: Params, scenario: Scenario) -> None
     for name in ("star", "gyro", "actuator"):
         for axis, fault in getattr(scenario, name)._asdict().items():
             check_fault(f"scenario.{name}.{axis}", fault)
+    return lanes
 
 
 def system_of(generator: Generator = LMMSE, window: int = 1, dt: float = DT) -> System:

@@ -401,8 +401,9 @@ def normals_of(v, amplitude):
     return jnp.asarray(np.stack([normal, 0 * normal, 0 * normal], axis=1))
 
 
-def refuse_bad(params: Params, scenario: Scenario) -> None:
-    """The system's check: ValueError on input outside physics' domain."""
+def refuse_bad(params: Params, scenario: Scenario) -> tuple:
+    """The system's check: ValueError on input outside physics' domain; returns the lanes."""
+    lanes = check.shapes(params, scenario, Params(), Scenario())
     for name in ("duration", "K", "J_w", "J_hat", "a_m", "P0", "residual_max"):
         check.positive(f"params.{name}", getattr(params, name))
     for name in ("turn", "forward", "b_m", "a_r", "a_y", "blend"):
@@ -441,16 +442,18 @@ def refuse_bad(params: Params, scenario: Scenario) -> None:
     check.finite("scenario.torque", scenario.torque)
     for name in ("attitude", "tacho", "drive", "friction"):
         check_fault(f"scenario.{name}", getattr(scenario, name))
+    return lanes
 
 
-def _refuse_bad(sampled: bool, dt: float, substeps: int, params: Params, scenario: Scenario) -> None:
-    refuse_bad(params, scenario)
+def _refuse_bad(sampled: bool, dt: float, substeps: int, params: Params, scenario: Scenario) -> tuple:
+    lanes = refuse_bad(params, scenario)
     if check.concrete(scenario.delay):
         delay, longest = np.asarray(scenario.delay), DELAYS * dt
         inside = (delay >= 0) & (delay <= longest * (1 + 1e-9))
         check.each("scenario.delay", f"lie in 0 to {longest:g} s", delay, inside)
     if check.concrete((params, scenario)):
         _warn_of_fast_adaptation(sampled, dt, substeps, params, scenario)
+    return lanes
 
 
 def _warn_of_fast_adaptation(sampled: bool, dt: float, substeps: int, params: Params, scenario: Scenario) -> None:
