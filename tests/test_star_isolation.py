@@ -1,4 +1,4 @@
-"""The loop `star_isolation`: its filters against plain matrices, the spec's numbers, gradients and the door."""
+"""The loop `star_isolation`: its filters against plain matrices, the reference's numbers, gradients and the door."""
 
 import jax
 
@@ -12,8 +12,9 @@ import numpy as np  # noqa: E402
 import pytest  # noqa: E402
 
 import jaxatt  # noqa: E402
-from jaxatt import Fault, Quat, Vec3, detection, estimators, scores  # noqa: E402
+from jaxatt import Fault, Quat, Vec3, detection, lmmse, scores  # noqa: E402
 from jaxatt.replay import replay  # noqa: E402
+from jaxatt.study import batch  # noqa: E402
 from jaxatt.systems import star_isolation as star  # noqa: E402
 from jaxatt.systems.star_isolation import ARCSEC, DEG, HEALTHY, PITCH, ROLL, params, scenario  # noqa: E402
 
@@ -105,7 +106,7 @@ def test_multiplicative_noise_has_the_closed_form():
     Q = np.cov(np.random.default_rng(0).standard_normal((4, 9)))
     B = [-DT / 2 * right(np.r_[0, e]) for e in np.eye(3)]
     plain = sum(0.3**2 * b @ Q @ b.T for b in B)
-    np.testing.assert_allclose(np.array(estimators.rate_noise(Q, 0.3, DT)), plain, atol=1e-15)
+    np.testing.assert_allclose(np.array(lmmse.rate_noise(Q, 0.3, DT)), plain, atol=1e-15)
 
 
 @pytest.mark.parametrize("own", [ROLL, PITCH])
@@ -138,7 +139,7 @@ def test_the_steady_state_satisfies_17(run):
     np.testing.assert_allclose(settled, x, atol=1e-12)
 
 
-# the spec's numbers
+# the reference's numbers
 
 
 def test_time_constants(run):
@@ -190,7 +191,7 @@ def test_a_star_fault_towards_the_other_star_opens_the_angle(run):
 
 def swept(one, n, p=params):
     """Scores of n runs whose initial estimates err as the prior says."""
-    many = spread(one, n)
+    many = batch(one, n)
     errors = params.std_qv * np.random.default_rng(0).standard_normal((3, 2, n))
     guess = Quat(np.broadcast_to(many.q.w, (2, n)), *(np.broadcast_to(a, (2, n)) + e for a, e in zip(many.q.v, errors)))
     many = many._replace(q_hat=guess)
@@ -228,10 +229,6 @@ def test_a_gyro_bias_raises_both_residuals():
     bias = DEG / 3600 / np.sqrt(3)
     _, settled = swept(healthy._replace(bias=Vec3(bias, bias, bias)), 128)
     np.testing.assert_allclose(settled.mean(axis=1), [3.9, 4.8], rtol=0.05)
-
-
-def spread(one, n):
-    return jax.tree.map(lambda a: np.broadcast_to(np.asarray(a, float)[..., None], (*np.shape(a), n)), one)
 
 
 # the other filters
