@@ -6,7 +6,8 @@ closed loop gives the functions and where the board starts::
     board = loop.init(loop.params, loop.scenario)[1].board
     boards, logs = replay(loop.decide, loop.params, board, readings, dt=loop.DT)
 
-What the scenario decides of a board is its start alone: initial estimates and the like. `load` reads a CSV or Parquet
+Of a board the scenario decides the start alone: initial estimates and the like. Where an observer or an adaptive law
+moves between ticks (`observer_pd`, `wheel_mrac`), ``flow=loop.board_flow`` and the system's ``substeps`` go along. `load` reads a CSV or Parquet
 file, which never executes code, and `resample` brings its samples to the ticks.
 """
 
@@ -72,17 +73,12 @@ def _length(name: str, tree) -> int:
     leaves = jax.tree_util.tree_leaves_with_path(tree)
     if not leaves:
         raise ValueError(f"`{name}` must hold at least one array, but it is empty.")
-    shapes = {name + jax.tree_util.keystr(path): np.shape(leaf) for path, leaf in leaves}
-    lengths = {shape[:1] for shape in shapes.values()}
-    first = next(iter(shapes.values()))[:1]
-    for path, shape in shapes.items():
+    first = np.shape(leaves[0][1])[:1]
+    for path, leaf in leaves:
+        shape = np.shape(leaf)
         if not shape or shape[:1] != first or shape[0] == 0:
-            check.refuse(
-                path,
-                "lead with the ticks, as many as the others" + (" (at least one)" * (first == (0,))),
-                f"of shape {shape}",
-            )
-    assert len(lengths) == 1
+            must = "lead with the ticks, at least one and as many as in the others"
+            check.refuse(name + jax.tree_util.keystr(path), must, f"of shape {shape}")
     return first[0]
 
 
@@ -223,7 +219,8 @@ def resample(t, columns: Mapping[str, Any], *, dt: float, ticks: int | None = No
     """Irregular samples brought to ticks: a `Reading` of shape (ticks,) for each channel.
 
     Tick k stands for the time t[0] + k dt. It takes the sample nearest to it and at most dt / 2 away; where there is
-    none, or it is NaN, the reading is not valid and repeats the last valid one (before the first, it gives the first).
+    none, or it is NaN, the reading is not valid and repeats the last valid one (before the first, it gives the first):
+    what on-board code sees that takes values without validity.
     ticks: how many; None: up to the last sample.
 
     Raises what `checked` raises, and ValueError for dt <= 0, ticks < 1 and times that span more than `SPARSE` ticks
