@@ -315,7 +315,7 @@ def subsets(out, values: Mapping[str, Any], *, names: str = "ABCD", what: str = 
 # momentum
 
 
-def singular_surface(gimbals: GimbalAxes, reversed: int = 0, ax=None, *, fine: int = 80) -> Axes:
+def singular_surface(gimbals: GimbalAxes, reversed: int = 0, ax: Any = None, *, fine: int = 80) -> Axes:
     """The singular momenta of a cluster with so many modules reversed, 0 for the envelope, and the rims of its holes.
 
     gimbals: (n,) without lanes. ax: three-dimensional. fine: patches from pole to pole. Momenta are in units of one
@@ -351,6 +351,7 @@ def singular_surface(gimbals: GimbalAxes, reversed: int = 0, ax=None, *, fine: i
     ax.set(xlim=limits, ylim=limits, zlim=limits)
     ax.set(xlabel="$h_x$ [$h_w$]", ylabel="$h_y$ [$h_w$]", zlabel="$h_z$ [$h_w$]")
     ax.set_box_aspect((1, 1, 1), zoom=0.85)  # room for the labels
-    for axis in (ax.xaxis, ax.yaxis, ax.zaxis):
+    panes: Any = (ax.xaxis, ax.yaxis, ax.zaxis)
+    for axis in panes:
         axis.set_pane_color((0.5, 0.5, 0.5, 0.1))
     return ax

@@ -7,8 +7,8 @@ closed loop gives the functions and where the board starts::
     boards, logs = replay(loop.decide, loop.params, board, readings, dt=loop.DT)
 
 Of a board the scenario decides the start alone: initial estimates and the like. Where an observer or an adaptive law
-moves between ticks (`observer_pd`, `wheel_mrac`), ``flow=loop.board_flow`` and the system's ``substeps`` go along. `load` reads a CSV or Parquet
-file, which never executes code, and `resample` brings its samples to the ticks.
+moves between ticks (`observer_pd`, `wheel_mrac`), ``flow=loop.board_flow`` and the system's ``substeps`` go along.
+`load` reads a CSV or Parquet file, which never executes code, and `resample` brings its samples to the ticks.
 """
 
 from __future__ import annotations
@@ -233,18 +233,18 @@ def resample(t, columns: Mapping[str, Any], *, dt: float, ticks: int | None = No
         check.refuse(
             "time", f"span at most {SPARSE} ticks of {dt:g} s for each sample", f"{len(t)} samples in {span:.3g} ticks"
         )
-    ticks = round(span) + 1 if ticks is None else check.whole("ticks", ticks)
+    n = round(span) + 1 if ticks is None else check.whole("ticks", ticks)
     out = {}
     for name, a in columns.items():
         known = np.isfinite(a)
         place = (t[known] - t[0]) / dt
         tick = np.floor(place + 0.5).astype(int)
         order = np.argsort(-np.abs(place - tick), kind="stable")  # the nearest is written last
-        order = order[tick[order] < ticks]
-        sample = np.full(ticks, -1)
+        order = order[tick[order] < n]
+        sample = np.full(n, -1)
         sample[tick[order]] = order
         valid = sample >= 0
-        last = np.maximum.accumulate(np.where(valid, np.arange(ticks), -1))
+        last = np.maximum.accumulate(np.where(valid, np.arange(n), -1))
         held = np.where(last >= 0, sample[last], 0)
         out[name] = Reading(a[known][held], valid)
     return out
