@@ -151,8 +151,7 @@ def surfaces(report: Report) -> None:
             minus = example.count(-1)
             plot.singular_surface(group[name], minus, ax)
             kind = "external" if minus == 0 else f"internal, {minus} of {n} reversed"
-            size = 4 if name == "box-90" else 3
-            ax.set(xlim=(-size, size), ylim=(-size, size), zlim=(-size, size), title=f"{n} modules, {kind}")
+            ax.set(xlim=(-4, 4), ylim=(-4, 4), zlim=(-4, 4), title=f"{n} modules, {kind}")  # one scale for all
         fig.suptitle(f"Singular momenta, {name}; circles and discs: gimbal axis along the singular direction")
         fig.tight_layout(w_pad=3, h_pad=4)
         report.figure(f"figures_3_4_13_16_{name}", fig)
