@@ -658,7 +658,8 @@ def likelihood(theta, readings):
     """Mean negative log likelihood of the innovations of both filters, theta = log (sg, ss) believed / true."""
     p = params._replace(std_gyro=params.std_gyro * jnp.exp(theta["gyro"]), std_star=STD * jnp.exp(theta["star"]))
     n = readings.gyro.x.shape[1]
-    start = jax.tree.map(lambda a: jnp.broadcast_to(a[..., None], (*a.shape, n)), init(LMMSE, 1, p, healthy)[1].board)
+    wide = lambda a: jnp.broadcast_to(jnp.asarray(a)[..., None], (*jnp.shape(a), n))
+    start = jax.tree.map(wide, init(LMMSE, 1, p, healthy)[1].board)
     of = jax.tree.map(lambda a: a[1:], replay(decide, p, start, readings, dt=DT)[1].innovation)
     return 0.5 * jnp.mean(of.log_det + of.nis)
 

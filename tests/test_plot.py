@@ -8,6 +8,7 @@ import xarray
 from matplotlib.colors import to_rgb
 from matplotlib.lines import Line2D
 from matplotlib.text import Text
+from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from jaxatt import Fault, detection, on_axes, plot
 from jaxatt import singularity as sg
@@ -151,10 +152,12 @@ def test_onsets_are_found_in_any_scenario():
 
 
 @pytest.mark.parametrize("reversed", [0, 1])
-def test_the_surface_reaches_as_far_as_the_cluster(reversed):
-    gimbals = cmg_loss.scenario.axes
-    ax = plot.singular_surface(gimbals, reversed)
-    points = np.concatenate([np.asarray(c._vec)[:3].T for c in ax.collections if c._vec.shape[1] > 1000])
+def test_the_surface_reaches_as_far_as_the_cluster(reversed, monkeypatch):
+    gimbals, drawn = cmg_loss.scenario.axes, []
+    patches = lambda quads, **look: drawn.append(np.reshape(quads, (-1, 3))) or Poly3DCollection(quads, **look)
+    monkeypatch.setattr(plot, "Poly3DCollection", patches)
+    ax = plot.singular_surface(gimbals, reversed, fine=60)
+    points = np.concatenate(drawn)
     least = float(np.asarray(sg.reach(gimbals, Vec3(*(points[::499].T / np.linalg.norm(points[::499], axis=1))))).min())
     far = np.linalg.norm(points, axis=1)
     limit = np.asarray(jax.jit(lambda d: sg.support(gimbals, d))(Vec3(*np.eye(3))))
