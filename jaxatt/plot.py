@@ -149,7 +149,7 @@ def heat_map(
 ) -> Axes:
     """Mean of a score over two quantities of the scenarios, such as the share of faults detected; empty cells blank.
 
-    data: columns of shape (n,), of which three are named. bins: cells along each axis. log: which of x and y run
+    data: columns of shape (n,); x, y and value name three of them. bins: cells along each axis. log: which of x and y run
     over decades. chance: the level that a detector reaches by luck, marked on the colour bar.
 
     Raises ValueError for an unknown name, a label without unit and values <= 0 on a logarithmic axis.
@@ -252,7 +252,7 @@ def front(costs) -> np.ndarray:
 def pareto(data, x: str, y: str, *, marked: Mapping[str, int] | None = None, labels=None, ax=None) -> Axes:
     """Designs by two costs, both to be small, with the front of those that no other one beats.
 
-    data: columns of shape (n,). marked: names of designs, by their number, such as ``{"paper": 0}``.
+    data: columns of shape (n,); x and y name two of them. marked: names of designs, by their number, such as ``{"paper": 0}``.
     """
     ax = _new(ax, figsize=(6.6, 4.0))
     costs = np.stack([np.asarray(column(data, name), float) for name in (x, y)], axis=1)
@@ -273,7 +273,7 @@ def pareto(data, x: str, y: str, *, marked: Mapping[str, int] | None = None, lab
 def subsets(out, values: Mapping[str, Any], *, names: str = "ABCD", what: str = "dead gyros", axes=None) -> np.ndarray:
     """A table of subsets, such as the sixteen of four gyros: what each gives, above the units that are out.
 
-    out: (subsets, units) bool. values: by axis label with unit, (subsets,) or several of them by name; inf is
+    out: (subsets, units) bool; names: a letter for each unit; what: the label of the table. values: by axis label with unit, (subsets,) or several of them by name; inf is
     written as "never". Returns the axes, that of the table last.
     """
     out = np.asarray(out, bool)
