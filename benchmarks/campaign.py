@@ -30,19 +30,15 @@ def rows(quick: bool):
 def kills(folder: Path, count: int, seed: int = 0):
     """Kill -9 a campaign at random moments, resume it, and compare all files with those of an uninterrupted one."""
     context, rng, n = tiny.processes(), np.random.default_rng(seed), BLOCKS * 128
-    process = context.Process(target=tiny.work, args=(folder / "whole.zarr", BLOCKS))
     started = time.perf_counter()
-    process.start()
-    while not (folder / "whole.zarr" / "done" / "c" / "0").exists():
-        time.sleep(0.001)
-    first = time.perf_counter() - started
-    process.join()
-    last = time.perf_counter() - started
+    tiny.killed(context, folder / "x.zarr", BLOCKS, BLOCKS, 0.0)
+    whole = time.perf_counter() - started
+    run(folder / "whole.zarr", tiny.campaign(), n, progress=False)
     expected, deaths, identical = tiny.files(folder / "whole.zarr"), [], 0
     for k in range(count):
-        path, warm = folder / f"{k}.zarr", k % 10 > 0  # one in ten at any moment of the start
-        moment = rng.uniform(0, 0.8 * (last - first) if warm else first)
-        deaths.append(tiny.killed(context, path, BLOCKS, moment, warm))
+        after = int(rng.integers(1, BLOCKS)) if k % 10 else 0  # one in ten dies at any moment of all
+        path, moment = folder / f"{k}.zarr", rng.uniform(0, 0.03 if after else whole)
+        deaths.append(tiny.killed(context, path, BLOCKS, after, moment))
         run(path, tiny.campaign(), n, progress=False)
         identical += tiny.files(path) == expected
     partial = sum(0 < death.blocks < BLOCKS for death in deaths)

@@ -176,8 +176,8 @@ def test_killed_at_random_moments_and_resumed(tmp_path):
     expected = tiny.files(tmp_path / "whole.zarr")
     for k in range(3):
         path = tmp_path / f"{k}.zarr"
-        death = tiny.killed(context, path, 40, rng.uniform(0, 0.4))
-        assert death.blocks >= 1
+        death = tiny.killed(context, path, 40, int(rng.integers(1, 36)), rng.uniform(0, 0.03))
+        assert 1 <= death.blocks < 40
         run(path, tiny.campaign(), 40 * 128)
         assert tiny.files(path) == expected, death
 

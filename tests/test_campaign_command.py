@@ -80,5 +80,7 @@ def test_every_experiment_draws_scenarios_that_its_door_lets_in(name):
     params, scenarios = check.converted(this.params, scenarios)
     this.system.check(params, scenarios)
     assert check.lanes(scenarios) == 128
+    found = module._variables(this)  # names and units fit
+    assert {v.role for v in found.values()} == {"status", "score", "input"} and set(this.units) <= set(found)
     for values in jax.tree.leaves(inputs):
         assert np.isfinite(values).all() and (np.ptp(values, axis=-1) > 0).all()
