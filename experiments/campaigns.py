@@ -165,7 +165,8 @@ def scenario_wheel(d):
 
 
 def score_wheel(_, pair, now, log):
-    return wm.score(*pair, now, log)
+    params, scenario = pair
+    return wm.score(params, scenario, now, log)
 
 
 RATE, SECONDS = "rad/s", "s"

@@ -562,8 +562,8 @@ def _try(store: Store, block: int, compute: Callable) -> None:
 
 
 def _here(campaign: Campaign, spans, advance: Callable) -> Iterator:
-    for span in spans:
-        yield span, results(campaign, *span, advance)
+    for start, stop in spans:
+        yield (start, stop), results(campaign, start, stop, advance)
 
 
 def _elsewhere(campaign: Campaign, spans, executor: Executor, advance: Callable) -> Iterator:
