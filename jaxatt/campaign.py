@@ -54,7 +54,7 @@ class Campaign(NamedTuple):
     """
 
     system: System
-    params: Any  # what the engineer ships
+    params: Any  # `Params` of the loop, what the engineer ships
     sample: Callable  # (key, index) -> scenario
     key: Any  # of the noise, as in `sweep`; `sample` gets one split off it, `sampling_key`
     ticks: int
@@ -155,7 +155,7 @@ class Variable(NamedTuple):
     role: str  # score, input, record or status
     dims: tuple  # names of the axes; the last is "scenario"
     shape: tuple  # all axes but the last
-    dtype: Any
+    dtype: Any  # `numpy.dtype`
 
 
 def _variables(campaign: Campaign) -> dict[str, Variable]:
@@ -292,7 +292,7 @@ class Store(NamedTuple):
     """An open store."""
 
     path: Path
-    group: Any  # of Zarr
+    group: Any  # `zarr.Group`
     arrays: dict  # of Zarr arrays by name, `OWN` too
     manifest: dict
 
@@ -654,9 +654,10 @@ def until(path, campaign: Campaign, looks, success: Callable, half_width: float,
     """Run a campaign until the confidence interval of a rate is narrow enough, at the latest to the last look.
 
     looks: growing numbers of scenarios at which the interval is looked at, fixed beforehand; multiples of the
-    block are cheapest. success(dataset) -> bools, one for each scenario; their share is the rate. However it
-    stopped, the interval covers the rate with probability of at least ``level`` (`jaxatt.summary.narrowed`), if
-    the scenarios are iid. how: the keywords of `run`, but for shards, which cannot see each other's scenarios.
+    block are cheapest. success(dataset) -> bools, one for each scenario; their share is the rate. half_width: of its
+    interval, at which to stop. However it stopped, the interval covers the rate with probability of at least
+    ``level`` (`jaxatt.summary.narrowed`), if the scenarios are iid. how: the keywords of `run`, but for shards,
+    which cannot see each other's scenarios.
 
     Returns the dataset up to the look at which it stopped, and the `Rate` there.
     """

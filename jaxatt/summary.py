@@ -28,7 +28,7 @@ class Rate(NamedTuple):
 
 
 def rate_of(successes: int, trials: int, level: float = 0.95) -> Rate:
-    """Clopper and Pearson's interval: it covers the true share with probability of at least ``level``."""
+    """Clopper and Pearson's interval of successes in trials: it covers the true share with probability >= ``level``."""
     k, n, tail = check.whole("successes", successes, 0), check.whole("trials", trials), (1 - level) / 2
     low = 0.0 if k == 0 else float(stats.beta.ppf(tail, k, n - k + 1))
     high = 1.0 if k == n else float(stats.beta.isf(tail, k + 1, n - k))
@@ -74,7 +74,7 @@ def rates(dataset, level: float = 0.95) -> dict[str, Rate]:
 
 
 def quantiles(dataset, levels=(0.05, 0.5, 0.95)) -> dict[str, np.ndarray]:
-    """Quantiles of every number among the scores, NaN left out, by the inverse of the empirical distribution."""
+    """Quantiles at levels of every number among the scores, NaN left out: the inverse of the empirical distribution."""
     found = {}
     for name, a in columns(dataset, "score"):
         a = a[~np.isnan(a)] if a.dtype.kind == "f" else a
