@@ -30,7 +30,7 @@ import jaxlib
 import numpy as np
 
 from jaxatt import check
-from jaxatt.engine import BLOCK, System, block_records, block_scores, compiled, raw_key
+from jaxatt.engine import BLOCK, System, block_records, block_scores, compiled, one_key
 from jaxatt.study import _bar, _lanes_of, logged, scored
 from jaxatt.summary import Rate, narrowed
 
@@ -193,6 +193,8 @@ def _variables(campaign: Campaign) -> dict[str, Variable]:
 
 def _admitted(campaign: Campaign) -> Campaign:
     """The campaign with plain NumPy leaves, checked."""
+    for name in ("sample", "score"):
+        check.function(f"campaign.{name}", getattr(campaign, name))
     check.whole("campaign.ticks", campaign.ticks)
     check.whole("campaign.every", campaign.every)
     if check.whole("campaign.block", campaign.block) % BLOCK:
@@ -200,7 +202,7 @@ def _admitted(campaign: Campaign) -> Campaign:
     if campaign.size is not None:
         check.whole("campaign.size", campaign.size)
     params, _ = check.converted(campaign.params, ())
-    return campaign._replace(params=jax.tree.map(np.asarray, params), key=np.asarray(raw_key(campaign.key)))
+    return campaign._replace(params=jax.tree.map(np.asarray, params), key=np.asarray(one_key(campaign.key)))
 
 
 def _name(thing) -> str:
