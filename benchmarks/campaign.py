@@ -69,10 +69,9 @@ def memory(folder: Path, few: int, many: int):
     yield dict(name="  the many over the few", value=peaks[many] / peaks[few], unit="1")
 
 
-def overhead(folder: Path, repeats: int, blocks: int = 4):
+def overhead(folder: Path, repeats: int, blocks: int = 4, size: int = 8192):
     """CPU time of campaigns over that of the bare sweep of the same scenarios, in blocks of at least a second."""
     base = campaign("observer_pd", 1)
-    size = 16 * 1024 * len(jax.local_devices())
     base, n = base._replace(block=size), blocks * size
     many = scenarios(base, 0, n)
 
