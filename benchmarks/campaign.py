@@ -8,7 +8,6 @@ import tempfile
 import time
 from pathlib import Path
 
-import jax
 import numpy as np
 
 from benchmarks import tiny_campaign as tiny

@@ -22,7 +22,7 @@ def plan(monkeypatch):
 
 def test_the_command_runs_stops_on_interrupt_and_goes_on(plan, tmp_path, monkeypatch, capsys):
     words = ["--n", "1024", "--block", "128", "--out", str(tmp_path / "x")]
-    write, blocks = module._write, []
+    write, blocks = module.write_block, []
 
     def interrupted(*args):
         write(*args)
@@ -30,9 +30,9 @@ def test_the_command_runs_stops_on_interrupt_and_goes_on(plan, tmp_path, monkeyp
         if len(blocks) == 3:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(module, "_write", interrupted)
+    monkeypatch.setattr(module, "write_block", interrupted)
     assert campaigns.main("tiny", words) == 130
-    monkeypatch.setattr(module, "_write", write)
+    monkeypatch.setattr(module, "write_block", write)
     told = capsys.readouterr().err
     assert "every block written is kept. To go on: python -m experiments tiny campaign --n 1024" in told
     assert told.rstrip().endswith("--resume") and "scenarios/s" in told
