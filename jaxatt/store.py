@@ -37,6 +37,7 @@ class Variable(NamedTuple):
     dims: tuple  # names of the axes; the last is "scenario"
     shape: tuple  # all axes but the last
     dtype: Any  # `numpy.dtype`
+    units: str = ""  # "" where none are given
 
 
 class Store(NamedTuple):
