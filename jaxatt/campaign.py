@@ -43,7 +43,7 @@ from jaxatt.store import (
     take,
     write_block,
 )
-from jaxatt.study import _bar, _lanes_of, logged, scored
+from jaxatt.study import _bar, _lanes_of, _unpacked, logged, scored
 from jaxatt.summary import Rate, narrowed
 
 try:
@@ -83,22 +83,39 @@ def sampling_key(key):
 # the numbers of some scenarios
 
 
-def _draw(sample, inputs, key, indices):
+def _lanes(sample, inputs, key, indices):
     def one(index):
         return sample(key, index), ({} if inputs is None else inputs(key, index))
 
     return jax.vmap(one, out_axes=-1)(indices)
 
 
+@lru_cache
+def _layout(sample, inputs, real):
+    """The types of what is drawn, and how `_unpacked` gets it back; real: the default float type, which decides."""
+    del real
+    indices = jax.ShapeDtypeStruct((BLOCK,), np.int32)
+    leaves, structure = jax.tree.flatten(jax.eval_shape(partial(_lanes, sample, inputs), jax.random.key(0), indices))
+    kinds = sorted({str(a.dtype) for a in leaves})
+    return tuple(kinds), (structure, tuple((kinds.index(str(a.dtype)), a.shape[:-1]) for a in leaves))
+
+
+def _draw(sample, inputs, kinds, key, indices):
+    """One array (rows, 128) for each type: a hundred small ones would cost more than they hold."""
+    leaves = jax.tree.leaves(_lanes(sample, inputs, key, indices))
+    return [jnp.concatenate([a.reshape(-1, BLOCK) for a in leaves if str(a.dtype) == kind]) for kind in kinds]
+
+
 def _drawn(campaign: Campaign, start: int, stop: int):
     """Scenarios start .. stop - 1 and their inputs, lanes last; always drawn in whole blocks of 128, for the bits."""
     first, last = start // BLOCK, -(-stop // BLOCK)
-    key, draw = sampling_key(jnp.asarray(campaign.key)), compiled(_draw, 2)
+    kinds, layout = _layout(campaign.sample, campaign.inputs, jnp.result_type(float))
+    key, draw = sampling_key(jnp.asarray(campaign.key)), compiled(_draw, 3)
     most = (campaign.size or 2**31) - 1
     lanes = [np.minimum(np.arange(b * BLOCK, (b + 1) * BLOCK), most).astype(np.int32) for b in range(first, last)]
-    parts = [jax.tree.map(np.asarray, draw(campaign.sample, campaign.inputs, key, lane)) for lane in lanes]
+    parts = [[np.asarray(a) for a in draw(campaign.sample, campaign.inputs, kinds, key, lane)] for lane in lanes]
     here = slice(start - first * BLOCK, stop - first * BLOCK)
-    return jax.tree.map(lambda *a: np.concatenate(a, axis=-1)[..., here], *parts)
+    return _unpacked([np.concatenate(rows, axis=-1)[:, here] for rows in zip(*parts)], layout)
 
 
 def scenarios(campaign: Campaign, start: int, stop: int):

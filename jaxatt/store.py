@@ -95,7 +95,10 @@ def create(path: Path, variables: Mapping[str, Variable], manifest: Mapping, tim
 
 
 def open_store(path: Path, mode: Any = "r") -> Store:
-    """The store at path. Raises FileNotFoundError if there is none, ValueError if it is no campaign."""
+    """The store at path; mode: of Zarr, ``r`` or ``r+``.
+
+    Raises FileNotFoundError if there is none, ValueError if it is no campaign.
+    """
     if not path.exists():
         raise FileNotFoundError(f"`path` must be the store of a campaign, but there is nothing at {path}.")
     try:
