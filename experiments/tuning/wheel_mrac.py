@@ -91,7 +91,8 @@ def by_gradient(report, cost, steps: int):
     logarithm = lambda free, key: jnp.log(cost(GAINS.within(free), key))
     checked = gradient_check(logarithm, free, key)
     report.check("gradient against central difference, relative", 0, float(checked.relative.max()), 1e-5, "issue: 1e-5")
-    _, history = tune(logarithm, free, optax.adam(optax.exponential_decay(0.5, 5, 0.6)), steps, key)
+    optimizer = optax.adam(optax.exponential_decay(1.0, 3, 0.6), b1=0.5, b2=0.9)  # a short memory for a short search
+    _, history = tune(logarithm, free, optimizer, steps, key)
     history = history._replace(theta=jax.vmap(GAINS.within)(history.theta), cost=np.exp(history.cost))
     return history, compare.descent(history, compare.gradient_price(3))
 
