@@ -291,7 +291,8 @@ def cmg_steering(theta, key):
         k_p=0.2 * jnp.exp(theta["k_p"]), k_i=0.02 * jnp.exp(theta["k_i"]),
         steering=Steering(lam0=0.01 * jnp.exp(theta["lam0"]), dither=0.1),
     )  # fmt: skip
-    log = simulate(cmg.system._replace(substeps=1), p, cmg.scenario, key, ticks=20)
+    turned = cmg.scenario._replace(gamma=cmg.scenario.gamma + theta["turn"] * jnp.array([1.0, -1.0, 1.0, 0.0]))
+    log = simulate(cmg.system._replace(substeps=1), p, turned, key, ticks=20)
     return jnp.mean(log.w @ log.w) + 1e-3 * jnp.mean(log.acceleration)
 
 
@@ -315,7 +316,7 @@ def wheel_adaptation(theta, key):
     [
         (observer_pd, "alpha beta sigma k_q k_w0 size"),
         (gyro_ekf_pid, "k_p k_i k_d R"),
-        (cmg_steering, "k_p k_i lam0"),
+        (cmg_steering, "k_p k_i lam0 turn"),
         (star_filters, "std_gyro std_star bandwidth damping"),
         (wheel_adaptation, "K gamma P0"),
     ],
