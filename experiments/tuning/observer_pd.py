@@ -29,7 +29,7 @@ TICKS = 400  # 40 s: a slew, a gyro fault that grows from 15-20 s on, a star-sen
 QUIET_FROM = 5.0  # [s] from here to the onset an alarm is a false one; the observer converges meanwhile
 TEMPERATURE = 0.1  # [1] of the smooth alarm, in thresholds
 N = 128  # scenarios of a cost
-RATE = 0.1  # of Adam at the start; it falls to a twentieth
+RATE = 0.08  # of Adam at the start; it falls to a twentieth
 LAMBDA = 31.8566039  # [kg m^2] largest principal moment of the believed inertia
 TUNING, CHOICE, VERDICT = (jax.random.key(seed) for seed in (2030, 2031, 2032))
 PAPER = dict(alpha=1.1, beta=15.0, sigma=0.01, k_q=330.0, k_w0=125.0)
@@ -157,18 +157,22 @@ def cost_of(free, key, reference: dict, case):
     proof = op.margins(op.params._replace(**gains), LAMBDA)
     held = sum(penalty(t[name] - 0.96) for name in HELD) + penalty(t["post_u"] - case[-1])
     held = held + penalty(1 - proof.k_q) + penalty(0.1 - proof.T)
-    return weighted(t, dict(zip(WEIGHTS, case))) + 300 * held
+    return weighted(t, dict(zip(WEIGHTS, case))) + 100 * held
 
 
 def search(reference: dict, cases: np.ndarray, steps: int, save):
-    """All cases side by side, from the paper's gains, on other scenarios at every step; gains, and the history."""
+    """All cases side by side, on other scenarios at every step; gains, and the history.
+
+    From the hand-picked gains: their overshoot stays within the band of the settling time. From the paper's, which
+    do not overshoot, the search ends where the first overshoot reaches that band.
+    """
 
     def cost(theta, key):  # the case rides along: its gradient is zero, so no step moves it
         case = jax.lax.stop_gradient(theta["case"]).astype(int)
         return cost_of(theta["free"], key, reference, jnp.asarray(cases)[case])
 
     n = len(cases)
-    free = jax.tree.map(lambda a: jnp.full(n, a), BOUNDS.free(PAPER))
+    free = jax.tree.map(lambda a: jnp.full(n, a), BOUNDS.free(BY_HAND))
     rate = optax.cosine_decay_schedule(RATE, steps, 0.05)
     _, history = multi_start(cost, dict(free=free, case=np.arange(n, dtype=float)), optax.adam(rate), steps, TUNING,
                              fresh=True, save=save)  # fmt: skip
