@@ -38,9 +38,9 @@ BOUNDS = bounded(
     dict(alpha=0.05, beta=1.0, sigma=1e-3, k_q=20.0, k_w0=5.0),
     dict(alpha=20.0, beta=500.0, sigma=0.1, k_q=2000.0, k_w0=1000.0),
 )
-HELD = ("rms_u", "peak_u", "transient", "soft_settling", "slew")  # must not become worse
+HELD = dict(rms_u=0.97, peak_u=0.97, transient=0.97, soft_settling=0.96, slew=0.99)  # most, over the paper's: no worse
 WEIGHTS = ("post_q", "soft_delay", "soft_miss", "log_false")
-MOST = 0.7  # torque after the fault that a tuned point may take, over the paper's: less than the hand-picked gains do
+MOST = 0.71  # torque after the fault that a tuned point may take, over the paper's: less than the hand-picked gains do
 TUNED = {"balanced": (4.0, 1.0, 1.0, 0.4, MOST), "watchful": (4.0, 1.0, 1.0, 0.1, MOST)}  # weights, and that limit
 TRACKING = [(4.0, 1.0, 1.0, 0.4, most) for most in (0.55, 0.85)]  # of the fronts around them
 DETECTION = [(4.0, 1.0, 1.0, w, MOST) for w in (0.08, 0.2)]
@@ -143,7 +143,7 @@ def means(s: dict) -> dict:
 
 def terms(s: dict, reference: dict) -> dict:
     """The terms of the cost: scores over what the paper's gains give."""
-    t = {name: jnp.mean(s[name]) / reference[name] for name in (*WEIGHTS[:3], "post_u", "soft_false", *HELD[:4])}
+    t = {name: jnp.mean(s[name]) / reference[name] for name in (*WEIGHTS[:3], "post_u", "soft_false", *list(HELD)[:4])}
     t["log_false"] = jnp.log(t["soft_false"])
     t["slew"] = s["soft_settling"][0] / reference["slew"]
     return t
@@ -155,7 +155,7 @@ def cost_of(free, key, reference: dict, case):
     s = scored(gains, *slew_first(drawn(jax.random.fold_in(key, 0), N), jax.random.fold_in(key, 1)))
     t = terms(s, reference)
     proof = op.margins(op.params._replace(**gains), LAMBDA)
-    held = sum(penalty(t[name] - 0.96) for name in HELD) + penalty(t["post_u"] - case[-1])
+    held = sum(penalty(t[name] - most) for name, most in HELD.items()) + penalty(t["post_u"] - case[-1])
     held = held + penalty(1 - proof.k_q) + penalty(0.1 - proof.T)
     return weighted(t, dict(zip(WEIGHTS, case))) + 100 * held
 
