@@ -38,9 +38,9 @@ BOUNDS = bounded(
     dict(alpha=0.05, beta=1.0, sigma=1e-3, k_q=20.0, k_w0=5.0),
     dict(alpha=20.0, beta=500.0, sigma=0.1, k_q=2000.0, k_w0=1000.0),
 )
-HELD = dict(rms_u=0.97, peak_u=0.97, transient=0.97, soft_settling=0.96, slew=0.99)  # most, over the paper's: no worse
+HELD = ("rms_u", "peak_u", "transient", "soft_settling", "slew")  # must not become worse
 WEIGHTS = ("post_q", "soft_delay", "soft_miss", "log_false")
-MOST = 0.71  # torque after the fault that a tuned point may take, over the paper's: less than the hand-picked gains do
+MOST = 0.7  # torque after the fault that a tuned point may take, over the paper's: less than the hand-picked gains do
 TUNED = {"balanced": (4.0, 1.0, 1.0, 0.4, MOST), "watchful": (4.0, 1.0, 1.0, 0.1, MOST)}  # weights, and that limit
 TRACKING = [(4.0, 1.0, 1.0, 0.4, most) for most in (0.55, 0.85)]  # of the fronts around them
 DETECTION = [(4.0, 1.0, 1.0, w, MOST) for w in (0.08, 0.2)]
@@ -143,7 +143,7 @@ def means(s: dict) -> dict:
 
 def terms(s: dict, reference: dict) -> dict:
     """The terms of the cost: scores over what the paper's gains give."""
-    t = {name: jnp.mean(s[name]) / reference[name] for name in (*WEIGHTS[:3], "post_u", "soft_false", *list(HELD)[:4])}
+    t = {name: jnp.mean(s[name]) / reference[name] for name in (*WEIGHTS[:3], "post_u", "soft_false", *HELD[:4])}
     t["log_false"] = jnp.log(t["soft_false"])
     t["slew"] = s["soft_settling"][0] / reference["slew"]
     return t
@@ -155,7 +155,7 @@ def cost_of(free, key, reference: dict, case):
     s = scored(gains, *slew_first(drawn(jax.random.fold_in(key, 0), N), jax.random.fold_in(key, 1)))
     t = terms(s, reference)
     proof = op.margins(op.params._replace(**gains), LAMBDA)
-    held = sum(penalty(t[name] - most) for name, most in HELD.items()) + penalty(t["post_u"] - case[-1])
+    held = sum(penalty(t[name] - 0.96) for name in HELD) + penalty(t["post_u"] - case[-1])
     held = held + penalty(1 - proof.k_q) + penalty(0.1 - proof.T)
     return weighted(t, dict(zip(WEIGHTS, case))) + 100 * held
 
@@ -218,7 +218,11 @@ def each_judged(gains: dict, n: int) -> dict:
         varied(op.system), (), (params, repeated), key, ticks=TICKS, score=lambda _, pair, *a: score(*pair, *a)
     )
     judged = hard(swept, repeated) | dict(ok=swept["ok"])
-    return {name: np.mean(a.reshape(sets, n), axis=1) for name, a in judged.items()}
+    # the paper's own slew, on a finer grid of ticks
+    settling = lambda _, pair, now, log: scores.settling(now, norm(log.e_q) > 0.01)
+    pairs = batch(op.params, sets)._replace(**gains), batch(QUIET, sets)
+    slew = sweep(varied(FINE._replace(dt=0.02)), (), pairs, key, ticks=600, score=settling)
+    return {name: np.mean(a.reshape(sets, n), axis=1) for name, a in judged.items()} | dict(slew=slew)
 
 
 def fronts(report, reference: dict, found: list[dict]) -> dict:
@@ -229,7 +233,7 @@ def fronts(report, reference: dict, found: list[dict]) -> dict:
     every = {name: np.concatenate([drawn_gains[name], [g[name] for g in points]]) for name in PAPER}
     judged = each_judged(every, n)
     at = {name: values[sets] for name, values in judged.items()}  # the paper's
-    kept = np.all([judged[name] <= at[name] for name in ("rms_u", "peak_u", "transient", "settling")], axis=0)
+    kept = np.all([judged[name] <= at[name] for name in ("rms_u", "peak_u", "transient", "settling", "slew")], axis=0)
     quiet = judged["false_alarms"] <= at["false_alarms"]
     price = np.where(kept & quiet & (judged["ok"] == 1), priced(judged, at), np.inf)
     best = int(np.argmin(price[:sets]))
@@ -245,10 +249,10 @@ def fronts(report, reference: dict, found: list[dict]) -> dict:
 
     tracking, detection = ("post_q", "post_u"), ("delay", "false_alarms")
     others = [*np.flatnonzero(kept[:sets]), sets, sets + 1]
-    report.within("random and hand-picked sets that dominate balanced", None, 0, better(balanced, tracking, others),
-                  "error and torque")  # fmt: skip
-    report.within("the same for watchful", None, 0, better(watchful, detection, [*range(sets), sets, sets + 1]),
-                  "delay and false alarms")  # fmt: skip
+    report.within("sets no worse elsewhere that dominate balanced", None, 0, better(balanced, tracking, others),
+                  "error, torque; random, by hand")  # fmt: skip
+    report.within("sets that dominate watchful", None, 0, better(watchful, detection, [*range(sets), sets, sets + 1]),
+                  "delay, false alarms; random, by hand")  # fmt: skip
     fig, axes = plt.subplots(1, 2, figsize=(11, 4.6), layout="constrained")
     first = sets + 2 + len(TUNED)
     lines = {tracking: range(first, len(price))[: len(TRACKING)], detection: range(first, len(price))[len(TRACKING) :]}
