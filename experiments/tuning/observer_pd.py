@@ -272,7 +272,14 @@ def fronts(report, reference: dict, found: list[dict]) -> dict:
             inside = np.arange(sets)
         ax.scatter(judged[x][inside], show(inside), s=10, color="0.45", label="random")
         front = sorted([*lines[(x, y)], balanced if y == "post_u" else watchful], key=lambda i, x=x: judged[x][i])
-        ax.plot(judged[x][front], show(front), "o-", ms=5, color=BLUE, label="tuned, weights varied")
+        ax.plot(
+            judged[x][front],
+            show(front),
+            "o-" if y == "post_u" else "o",
+            ms=5,
+            color=BLUE,
+            label="tuned, weights varied",
+        )
         for i, marker, colour, name in (
             (sets, "s", ORANGE, "the paper's"), (sets + 1, "D", PINK, "picked by hand"), (best, "v", "k", "best random"),
             (balanced, "*", GREEN, "balanced"), (watchful, "P", GREEN, "watchful"),
