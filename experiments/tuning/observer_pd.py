@@ -358,7 +358,7 @@ def way(report, history) -> None:
     for name, label, colour, dashes in styles:
         right.plot(gains[name][:, 0] / PAPER[name], color=colour, ls=dashes, label=label)
     right.set(xlabel="step of the search, balanced", ylabel="gain / the paper's", yscale="log")
-    right.legend(ncols=2)
+    right.legend(ncols=2, loc="center right")
     report.figure("way", fig)
 
 
