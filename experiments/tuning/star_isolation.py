@@ -19,10 +19,11 @@ import numpy as np
 import optax
 
 from experiments.report import interval, plt
-from experiments.star_isolation import drawn, spread
+from experiments.star_isolation import drawn
 from experiments.tuning import compare
 from jaxatt import Fault, Vec3, detection, scores, simulate, sweep, tune
 from jaxatt.engine import compiled
+from jaxatt.study import batch
 from jaxatt.systems import star_isolation as si
 from jaxatt.systems.star_isolation import DT, LMMSE, PITCH, ROLL
 from jaxatt.tuning import bounded, gradient_check, value_and_gradient
@@ -75,7 +76,7 @@ def world(n: int, seed: int, onset: Any = ONSET * DT):
     size = rng.uniform(2, 5, n) * rng.choice([-1, 1], n) * si.params.std_star / np.sqrt(2)  # on both tangential axes
     own = lambda sensor: np.where(faulty == sensor, size, 0)
     o = np.zeros(n)
-    pair = spread(Fault(), n)._replace(onset=np.broadcast_to(onset, n))
+    pair = batch(Fault(), n)._replace(onset=np.broadcast_to(onset, n))
     pair = jax.tree.map(lambda a: np.broadcast_to(a, (2, n)), pair)
     star = Vec3(
         pair._replace(bias=np.stack([o, own(PITCH)])),
