@@ -315,8 +315,8 @@ STYLES = {  # colour-blind safe, and told apart in grey by the dashes
 def budget_figure(traces: dict[str, list[Trace]], budget: float, unit: str, title: str = ""):
     """Lowest cost so far against simulations spent, and how far it is above the lowest that any search found.
 
-    Median and range over the traces of each method. traces: for each method of `STYLES` its traces over seeds;
-    unit: of the cost, for the axis.
+    Median and range over the traces of each method. traces: for each method of `STYLES` its traces over seeds, that
+    of the gradient first; unit: of the cost, for the axis.
     """
     fig, (left, right) = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
     spent = np.unique(np.round(np.geomspace(1, budget, 400)))
@@ -333,8 +333,11 @@ def budget_figure(traces: dict[str, list[Trace]], budget: float, unit: str, titl
     for ax in (left, right):
         ax.set(xscale="log", xlim=(1, budget), xlabel="simulations (a gradient of p numbers: 1 + p)")
         ax.grid(alpha=0.3)
-    left.set(ylabel=f"lowest cost so far [{unit}]")
+    left.set(yscale="log" if least > 0 else "linear", ylabel=f"lowest cost so far [{unit}]")
     right.set(yscale="log", ylabel=f"the same, less the lowest of all [{unit}]")
+    gain = next(iter(traces.values()))[0].cost[0] - least
+    if np.isfinite(gain) and gain > 0:
+        right.set_ylim(1e-4 * gain, 2 * gain)  # no need to see a simplex polish its last digits
     left.legend(fontsize=8, title="median and range", title_fontsize=8)
     if title:
         fig.suptitle(title)
