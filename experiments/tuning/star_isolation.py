@@ -233,7 +233,8 @@ def verdict(report, chosen, n: int) -> None:
         report.note(compare.told("  mean delay [s]", change))
         for key, label in (("miss", "  missed"), ("right", "  right sensor"), ("false", "  runs with a false alarm")):
             c = compare.paired_share(table[name][key], tuned[key])
-            report.note(compare.told(label, c) + f", p = {compare.mcnemar(table[name][key], tuned[key]):.2g}")
+            p = compare.mcnemar(table[name][key], tuned[key])
+            report.note(compare.told(label, c) + (f", p = {p:.2g}" if p > 0 else ", p < 1e-300"))
         if name.startswith("paper"):
             report.within("tuned - paper, mean delay, upper end [s]", None, 0.0, change.high, f"{n} fresh runs")
     roc_figure(report, results, faulty)
