@@ -63,18 +63,49 @@ def alarm(evaluation, threshold, temperature):
 
 
 def detection(now, probability, onset, start=0.0) -> Detection:
-    """Tally delay, miss and false alarms of a `alarm` probability around a fault's onset [s].
+    """Tally delay, miss and false alarms of the probability of `alarm` around a fault's onset [s].
 
     start: when false alarms begin to count [s]. The delay is 0 for an alarm at the first tick of the fault; it is one
     tick less than `detection.soft_delay`, and can be had without keeping the run.
     """
-    before = now.t < onset
-    silent = jnp.where(before, 1, 1 - probability)
+    ill, quiet = now.t >= onset, (now.t < onset) & (now.t >= start)
+    silent = jnp.where(ill, 1 - probability, 1)
     return Detection(
-        delay=Delay(jnp.where(before, 0, now.dt * silent), silent),
-        miss=scores.mean(1 - probability, ~before),
-        false_alarms=scores.mean(probability, before & (now.t >= start)),
+        delay=Delay(jnp.where(ill, now.dt * silent, 0), silent),
+        miss=scores.mean(1 - probability, ill),
+        false_alarms=scores.mean(probability, quiet),
     )
+
+
+# settling
+
+
+class SoftSettling(NamedTuple):
+    """Expected last time [s] outside a band, counted from the start of a window; 0 if it was never left."""
+
+    time: Any = 0.0  # [s]
+    inside: Any = 1.0  # [1] probability of not having been outside
+    length: Any = 0.0  # [s] of the window so far
+
+    def __add__(self, later):
+        return SoftSettling(
+            self.length - later.inside * (self.length - self.time) + later.time,
+            self.inside * later.inside,
+            self.length + later.length,
+        )
+
+    def value(self):
+        return self.time
+
+
+def settling(now, outside, inside: Any = True) -> SoftSettling:
+    """Tally a smooth settling time [s]; outside: probability of being outside the band, `alarm` of the error.
+
+    The plain sum of ``outside`` would not see that an overshoot leaves the band once more, late but briefly.
+    """
+    out = jnp.where(inside, outside, 0)
+    length = jnp.where(inside, now.dt * jnp.ones_like(out), 0)
+    return SoftSettling(length * out, 1 - out, length)
 
 
 # chatter

@@ -1,5 +1,6 @@
 """Tuning by gradient: the search itself, on costs with known minima."""
 
+import importlib
 import os
 import signal
 import subprocess
@@ -12,7 +13,14 @@ import numpy as np
 import optax
 import pytest
 
-from jaxatt import System, scores, sweep
+from jaxatt import Fault, System, Vec3, on_axes, scores, simulate, sweep
+from jaxatt.controllers import Steering
+from jaxatt.objectives import alarm
+from jaxatt.systems import cmg_loss as cmg
+from jaxatt.systems import gyro_ekf as ge
+from jaxatt.systems import observer_pd as op
+from jaxatt.systems import star_isolation as si
+from jaxatt.systems import wheel_mrac as wm
 from jaxatt.tuning import (
     FEW,
     averaged,
@@ -185,11 +193,15 @@ def test_bounds_are_a_change_of_variables():
             assert (moved[name] >= low[name]).all() and (moved[name] <= high[name]).all()
     middle = bounds.within(jax.tree.map(jnp.zeros_like, theta))
     assert middle["share"] == 1 and middle["ratio"] == pytest.approx(1) and middle["gain"][0] == 1
+    box = bounded(np.array([-1.0, 0.0]), np.array([1.0, 5.0]))
+    np.testing.assert_allclose(box.within(box.free(np.array([0.5, 4.0]))), [0.5, 4.0], rtol=1e-6)
     np.testing.assert_allclose(bounded(0.0, np.inf).free(jnp.array([1.0, np.e])), [0, 1], atol=1e-6)
     with pytest.raises(ValueError, match=r"`theta\['share'\]` must lie in \(-1\.0, 3\.0\), but it is 3\."):
         bounds.free({**theta, "share": 3.0})
     with pytest.raises(ValueError, match="`low` must be less than high, 1, but it is 2"):
         bounded(2, 1).free(0.5)
+    with pytest.raises(ValueError, match="`high` must be finite or infinite throughout"):
+        bounded(0.0, np.array([1.0, np.inf])).free(np.array([0.5, 0.5]))
 
 
 # scenarios as the unknown
@@ -255,3 +267,81 @@ def test_the_gradient_check_knows_a_smooth_cost_from_a_staircase():
     lying = gradient_check(stairs, 0.317, KEY, step=0.03)
     assert lying.gradient[0] == pytest.approx(0.1)
     assert abs(lying.central[0] - 0.1) > 0.2 and lying.doubt[0] > 0.2 and lying.relative[0] > 1
+
+
+def observer_pd(theta, key):
+    p = op.params._replace(**{k: getattr(op.params, k) * jnp.exp(v) for k, v in theta.items() if k != "size"})
+    scenario = op.scenario._replace(
+        q_hat=Vec3(0.35, 0.2, -0.6), gyro=on_axes(Fault(1.0, drift=0.1 * jnp.exp(theta["size"])))
+    )
+    log = simulate(op.system, p, scenario, key, ticks=40)
+    return jnp.mean(log.e_q @ log.e_q) + 1e-6 * jnp.mean(log.u @ log.u) + 1e-2 * jnp.mean(alarm(log.xi, p.sigma, 0.01))
+
+
+def gyro_ekf_pid(theta, key):
+    """The loop as shipped, its Kalman filter included."""
+    scaled = {k: jnp.exp(v) * Vec3(*map(jnp.asarray, getattr(ge.params, k))) for k, v in theta.items() if k != "R"}
+    p = ge.params._replace(**scaled, R=jnp.exp(theta["R"]) * jnp.asarray(ge.params.R))
+    log = simulate(ge.system, p, ge.scenario, key, ticks=16)
+    return 1e9 * jnp.mean(log.angle @ log.angle) + 1e6 * jnp.mean(log.w @ log.w)
+
+
+def cmg_steering(theta, key):
+    p = cmg.Params(
+        k_p=0.2 * jnp.exp(theta["k_p"]), k_i=0.02 * jnp.exp(theta["k_i"]),
+        steering=Steering(lam0=0.01 * jnp.exp(theta["lam0"]), dither=0.1),
+    )  # fmt: skip
+    turned = cmg.scenario._replace(gamma=cmg.scenario.gamma + theta["turn"] * jnp.array([1.0, -1.0, 1.0, 0.0]))
+    log = simulate(cmg.system._replace(substeps=1), p, turned, key, ticks=20)
+    return jnp.mean(log.w @ log.w) + 1e-3 * jnp.mean(log.acceleration)
+
+
+def star_filters(theta, key):
+    p = si.params._replace(**{k: getattr(si.params, k) * jnp.exp(v) for k, v in theta.items()})
+    log = simulate(si.system, p, si.scenario, key, ticks=16)
+    return jnp.mean(log.nees) + 1e4 * jnp.mean(log.w @ log.w)
+
+
+def wheel_adaptation(theta, key):
+    p = wm.params._replace(
+        K=jnp.exp(theta["K"]), law=wm.params.law._replace(gamma=1e-6 * jnp.exp(theta["gamma"])),
+        P0=1e-6 * jnp.exp(theta["P0"]),
+    )  # fmt: skip
+    log = simulate(wm.loop(substeps=8), p, wm.scenario, key, ticks=60)
+    return jnp.mean(log.error**2) + 1e-8 * jnp.mean(log.step**2)
+
+
+@pytest.mark.parametrize(
+    ("cost", "names"),
+    [
+        (observer_pd, "alpha beta sigma k_q k_w0 size"),
+        (gyro_ekf_pid, "k_p k_i k_d R"),
+        (cmg_steering, "k_p k_i lam0 turn"),
+        (star_filters, "std_gyro std_star bandwidth damping"),
+        (wheel_adaptation, "K gamma P0"),
+    ],
+)
+def test_every_loops_gradient_equals_the_central_difference(cost, names):
+    found = gradient_check(cost, {name: 0.03 for name in names.split()}, KEY)
+    assert (np.abs(found.central) > 0).all()
+    assert found.relative.max() < 1e-5, found
+
+
+# the command
+
+
+@pytest.mark.parametrize(("words", "wrong"), [(["nothing", "tune"], "nothing"), (["observer_pd", "polish"], "polish")])
+def test_the_command_refuses_what_it_does_not_know(words, wrong, monkeypatch, capsys):
+    from experiments import __main__ as command
+
+    monkeypatch.setattr(sys, "argv", ["experiments", *words])
+    with pytest.raises(SystemExit):
+        command.main()
+    assert f"but it is {wrong}" in capsys.readouterr().err
+
+
+def test_every_paper_has_a_study_of_its_gains():
+    from experiments.__main__ import NAMES, STUDIES
+
+    for name in NAMES:
+        assert callable(importlib.import_module(f"{STUDIES['tune']}.{name}").run)
