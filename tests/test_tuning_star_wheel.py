@@ -1,4 +1,4 @@
-"""What the studies of star_isolation and wheel_mrac rest on: surrogates that mean what the loops do, exact slopes."""
+"""What the studies of star_isolation and wheel_mrac rest on: a surrogate that means what the loop does, bounds, seeds."""
 
 import jax
 import jax.numpy as jnp
@@ -13,13 +13,6 @@ from jaxatt.systems import star_isolation as si
 from jaxatt.systems import wheel_mrac as wm
 
 RUNS = 5
-
-
-def slope_and_difference(along, h):
-    """df/da at 0 in forward mode, and its central difference of fourth order; along(a) gives f and df/da."""
-    value = lambda a: along(a)[0]
-    central = (8 * (value(h) - value(-h)) - (value(2 * h) - value(-2 * h))) / (12 * h)
-    return np.asarray(along(0.0)[1]), np.asarray(central)
 
 
 # star_isolation
@@ -85,9 +78,9 @@ def test_the_hard_cost_is_what_the_loop_itself_does(flown, surrogate):
 
 def test_the_surrogate_becomes_the_hard_cost_and_its_slope_is_exact(surrogate):
     off_the_kink = 0.5  # the surrogate is linear in the window between whole numbers
-    shifted = lambda a: surrogate(off_the_kink + a, stars.TEMPERATURE)
-    exact, central = slope_and_difference(shifted, 1e-4)
-    assert exact == pytest.approx(central, rel=1e-5)
+    h, value = 1e-4, lambda a: surrogate(off_the_kink + a, stars.TEMPERATURE)[0]
+    central = (8 * (value(h) - value(-h)) - (value(2 * h) - value(-2 * h))) / (12 * h)
+    assert float(surrogate(off_the_kink, stars.TEMPERATURE)[1]) == pytest.approx(float(central), rel=1e-5)
     _, _, hard = surrogate(0.0, 1.0)
     hard = float(jnp.mean(stars.cost_of(*hard)))
     assert abs(surrogate(0.0, 1e-3)[0] / hard - 1) < 0.01 < abs(surrogate(0.0, 1.0)[0] / hard - 1)
@@ -116,22 +109,6 @@ def test_seeds_share_no_scenario_and_no_noise():
     assert not set(wheel.world(50, wheel.TUNE).J_z) & set(wheel.world(50, wheel.JUDGE).J_z)
     a, b = (noise_of(wm.system, jax.random.key(seed), 0, 3) for seed in (wheel.TUNE, wheel.JUDGE))
     assert np.all(np.asarray(a) != np.asarray(b))
-
-
-def test_the_slope_of_the_wheels_cost_is_exact(monkeypatch):
-    monkeypatch.setattr(wheel, "TICKS", 300)
-    scenarios = jax.tree.map(lambda a: a[:4], wheel.world(4, 5))
-    scenarios = scenarios._replace(
-        wheel=scenarios.wheel._replace(friction=np.zeros(4)), drive=scenarios.drive._replace(onset=np.full(4, 3.0))
-    )
-
-    def cost(a):
-        gains = (1.3 * jnp.exp(a), 1e-8 * jnp.exp(-a), 1e-6 * jnp.exp(2 * a))
-        return jnp.log(wheel.each_cost(gains, jax.random.key(5), scenarios))
-
-    exact, central = slope_and_difference(jax.jit(lambda a: jax.jvp(cost, (a,), (1.0,))), 3e-4)
-    np.testing.assert_allclose(exact, central, rtol=1e-5)
-    assert np.all(exact != 0) and len(set(exact)) == 4
 
 
 def test_stuck_wheels_hold_one_kind_of_friction_each():

@@ -11,6 +11,7 @@ filter swallow the fault. Three seeds: one to tune on, one to choose the whole w
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -103,11 +104,27 @@ def threshold_of(window, margin):
     return detection.threshold_moment(margin, 3 * window)
 
 
+def residuals(params, data: Recorded):
+    """r' M^-1 r of both filters at every tick but the first, shape (END - 1, 2, n).
+
+    The filters alone: `jaxatt.replay.replay` would run the rest of the board too, tangents and all.
+    """
+
+    def step(carry, told):
+        filters, gyro = carry
+        filters, innovation = si.advanced(LMMSE, params, filters, gyro, told.stars, DT)
+        return (filters, told.gyro), innovation.nis
+
+    alone = jax.vmap(partial(LMMSE.start, params))
+    filters = jax.vmap(alone, in_axes=-1, out_axes=-1)(data.q_hat)
+    first, later = (jax.tree.map(lambda a, part=part: a[part], data.readings) for part in (0, slice(1, None)))
+    return jax.lax.scan(step, (filters, first.gyro), later)[1]
+
+
 def evaluated(numbers, data: Recorded):
-    """J of both filters with a window of real length, shape (END - 1, 2, n): tick 0 has none."""
+    """J of both filters with a window of real length, shape (END - 1, 2, n)."""
     window, _, std_gyro = numbers
-    nis = si.replay(LMMSE, si.params._replace(std_gyro=std_gyro), data.q_hat, data.readings).nis
-    return detection.soft_windowed(nis, window, LONGEST)
+    return detection.soft_windowed(residuals(si.params._replace(std_gyro=std_gyro), data), window, LONGEST)
 
 
 def terms_of(p, faulty):
