@@ -277,14 +277,17 @@ def contest(report, gradient: Trace, costs: Callable, start, low, high, budget: 
         least = [r.target for r in exact]
         report.note(f"{name}: least cost {np.median(least):.6g} ({min(least):.6g} to {max(least):.6g})")
         for label, some in (("its final cost", exact), ("99 % of its gain", near)):
-            its, ours = (float(np.median([getattr(r, side) for r in some])) for side in ("baseline", "gradient"))
+            its, ours, fewer, less = (
+                float(np.median([getattr(r, field) for r in some]))
+                for field in ("baseline", "gradient", "fewer", "fewer_than_budget")
+            )  # medians over seeds, so that fewer is not its / ours
             line = f"  {label}: after {its:.0f} simulations; gradient "
             if np.isinf(ours):
                 report.note(line + f"never in its {gradient.spent[-1]:.0f}")
                 continue
             report.note(
-                f"{line}after {ours:.0f}: {its / ours:.2g} times fewer, {budget / ours:.2g} times fewer than the budget "
-                f"of {budget}; in CPU time {its / ours * price / dearer:.2g} times less"
+                f"{line}after {ours:.0f}: {fewer:.2g} times fewer, {less:.2g} times fewer than the budget of {budget}; "
+                f"in CPU time {fewer * price / dearer:.2g} times less"
             )
     report.figure("budget", budget_figure(traces, budget, unit, report.experiment))
     return races

@@ -64,7 +64,7 @@ def run(report) -> None:
     chosen = choose(report, history, recorded(n, CHOOSE))
     verdict(report, chosen, 512 if report.quick else 4096)
     against_baselines(report, train, gradient, 60 if report.quick else 150, range(1 if report.quick else 3))
-    temperatures(report, train, chosen)
+    temperatures(report, train)
 
 
 # scenarios
@@ -301,32 +301,36 @@ def against_baselines(report, train: Recorded, gradient, budget: int, seeds) -> 
     compare.contest(report, gradient, costs, start, low, high, budget, "s", dearer, seeds)
 
 
-def temperatures(report, train: Recorded, chosen) -> None:
-    """What the temperature does: the surrogate leaves the hard cost, or its gradient drowns in noise."""
-    at = tuple(chosen + np.array([0.3, 0.0, 0.0]))  # between two whole windows
-
-    def along(margin, temperature, data):
-        return each_cost((at[0], margin, at[2]), data, temperature)
-
-    slope = compiled(lambda t, data: jax.jvp(lambda m: along(m, t, data), (at[1],), (1.0,)), 0)
-    hard = lambda margin: each_cost((at[0], margin, at[2]), train, hard=True)
-    steps, zero = jax.jit(lambda m: jax.jvp(hard, (m,), (1.0,)))(at[1])
+def temperatures(report, train: Recorded) -> None:
+    """What the temperature does at the start: the surrogate leaves the hard cost, or its gradient drowns in noise."""
+    window, margin, std_gyro = (*(START[:1] + 0.3), *START[1:])  # between two whole windows
+    along = lambda margin, temperature, data: each_cost((window, margin, std_gyro), data, temperature)
+    slope = compiled(lambda t, data: jax.jvp(lambda m: along(m, t, data), (margin,), (1.0,)), 0)
+    hard = lambda m, data: each_cost((window, m, std_gyro), data, hard=True)
+    steps = compiled(lambda m, data: jax.jvp(lambda m: hard(m, data), (m,), (1.0,)), 0)
+    cost, zero = (np.asarray(a) for a in steps(margin, train))
     report.check("gradient of the hard cost in the margin", 0.0, float(np.abs(zero).max()), 0.0, "a step has none")
-    truth = float(steps.mean())
+    wide = 0.25  # half the step of a difference that sees the hard cost's trend
+    trend = float(np.mean(steps(margin + wide, train)[0] - steps(margin - wide, train)[0])) / (2 * wide)
+    report.note(f"hard cost {cost.mean():.4f} s; its difference over +-{wide:g} of the margin {trend:.3f} s")
     levels = np.geomspace(0.03, 10, 6)
-    gaps, noises = [], []
+    gaps, errors, noises = [], [], []
     for level in levels:
         value, slopes = (np.asarray(a) for a in slope(float(level), train))
-        noise = slopes.std(ddof=1) / np.sqrt(slopes.size) / abs(slopes.mean())
-        gaps.append(value.mean() / truth - 1)
-        noises.append(noise)
+        gaps.append(abs(value.mean() / cost.mean() - 1))
+        errors.append(abs(slopes.mean() / trend - 1))
+        noises.append(slopes.std(ddof=1) / np.sqrt(slopes.size) / abs(slopes.mean()))
         report.note(
-            f"temperature {level:6.3g}: surrogate {value.mean():8.4f} s (hard {truth:.4f} s); d/d margin "
-            f"{slopes.mean():8.3f}, standard error over {slopes.size} runs {noise:.1%} of it"
+            f"temperature {level:6.3g}: surrogate {value.mean():9.4f} s; d/d margin {slopes.mean():9.3f} s, "
+            f"{errors[-1]:.1%} from that difference, standard error over {slopes.size} runs {noises[-1]:.1%}"
         )
     fig, ax = plt.subplots(figsize=(6.5, 4), layout="constrained")
-    ax.loglog(levels, np.abs(gaps), "o-", color=COLOURS[0], label="|surrogate / hard cost - 1|")
-    ax.loglog(levels, noises, "s--", color=COLOURS[1], label="standard error of the gradient / its mean")
+    for values, mark, colour, label in (
+        (gaps, "o-", COLOURS[0], "|surrogate / hard cost - 1|"),
+        (errors, "^-.", COLOURS[2], "|gradient / difference of the hard cost - 1|"),
+        (noises, "s--", COLOURS[1], "standard error of the gradient / its mean"),
+    ):
+        ax.loglog(levels, values, mark, color=colour, label=label)
     ax.axvline(TEMPERATURE, color="#777777", ls=":", label="used")
     ax.set(xlabel="temperature of the soft alarm, in J [1]", ylabel="share [1]")
     ax.grid(alpha=0.3)
