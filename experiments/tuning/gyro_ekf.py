@@ -167,8 +167,7 @@ def without_filter(report) -> None:
 def simulated(report, theta) -> None:
     """The tuned gains in the full loop: noise, biases, wheels turning, held-out initial states."""
     n = 8 if report.quick else 32
-    at = np.repeat(np.arange(16), n)
-    days = drawn(VERDICT, at)._replace(announced=np.zeros(16 * n))
+    days = drawn(VERDICT, range(16), n)._replace(announced=np.zeros(16 * n))
     report.note(f"no filter, {n} held-out initial states for each subset, 2000 s: largest |angle| at the end [deg]")
     ends = []
     for factors in (np.ones(9), np.exp(theta)):
@@ -228,16 +227,19 @@ def growth_figure(report, paper, tuned, history) -> None:
 # scenarios of all studies
 
 
-def drawn(seed: int, subsets) -> Scenario:
-    """Initial states, wheel momenta and biases drawn at random, the size of Table 6; subsets (n,) of dead gyros."""
-    rng, n = np.random.default_rng([seed, 7]), len(subsets)
-    normal = lambda *shape: rng.normal(size=(*shape, n))
-    return lanes(Scenario(), n)._replace(
+def drawn(seed: int, subsets, n: int) -> Scenario:
+    """Every subset of dead gyros, by number, with the same n random initial states, wheel momenta and biases.
+
+    They have the size of Table 6's; shape (len(subsets) * n), subset by subset.
+    """
+    rng, m = np.random.default_rng([seed, 7]), len(subsets)
+    normal = lambda *shape: np.tile(rng.normal(size=(*shape, n)), m)
+    return lanes(Scenario(), m * n)._replace(
         angle=Vec3(*(0.03 * DEG * normal(3))),
         w=Vec3(*(0.02 * DEG * normal(3))),
         h=10.0 * normal(4),
         bias=0.02 * DEG * normal(4),
-        gyro=failed(mask(*(SUBSETS[i] for i in subsets))),
+        gyro=failed(np.repeat(mask(*(SUBSETS[i] for i in subsets)), n, axis=1)),
     )
 
 
@@ -335,20 +337,19 @@ def pid_score(params, trial: Trial, now, log: Flight):
 
 def pid_gains(report) -> None:
     """Part 2."""
-    every = np.arange(16)
-    days = drawn(TUNE, np.tile(every, 2))
+    days = drawn(TUNE, range(16), 2)
     paper = float(jnp.mean(pid_costs(np.zeros(6), days, TUNE)))
     cost = lambda theta, key: jnp.mean(pid_costs(theta, days, TUNE)) / paper
     steps = 4 if report.quick else 14
     _, history = tune(cost, np.zeros(6), PID_OPTIMIZER, steps, jax.random.key(TUNE), forward=True)
 
-    budget = 60 if report.quick else 200
+    budget = 60 if report.quick else 160
     price = gradient_price(6)
     contest(report, descent(history, price), one_by_one(lambda x: cost(x, None)), np.zeros(6),
                     np.full(6, -PID_BOX), np.full(6, PID_BOX), budget, "of the paper's gains", seeds=range(2))  # fmt: skip
 
     # chosen on other states
-    other = drawn(CHOOSE, np.tile(every, 2))
+    other = drawn(CHOOSE, range(16), 2)
     judged = [float(jnp.mean(pid_costs(theta, other, CHOOSE))) for theta in history.theta]
     best = history.theta[int(np.argmin(judged))]
     report.note(
@@ -361,7 +362,7 @@ def pid_gains(report) -> None:
     )
 
     n = 8 if report.quick else 64
-    fresh = drawn(VERDICT, np.repeat(every, n))
+    fresh = drawn(VERDICT, range(16), n)
     got = []
     for theta in (np.zeros(6), best):
         key = jax.random.key(VERDICT)
@@ -434,7 +435,7 @@ def filter_with(levels) -> Params:
 
 def recorded(seed: int, n: int) -> Flight:
     """Readings, commands and truth of n flights, the gyros healthy, noise and kicks at their true levels."""
-    days = drawn(seed, np.zeros(n, int))
+    days = drawn(seed, [0], n)
     days = days._replace(**{name: np.full(n, value) for name, value in TRUE_STD.items()})
     return flights(params, trials(np.zeros(6), days, unrest=1.0), seed)
 
