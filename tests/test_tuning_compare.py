@@ -141,6 +141,12 @@ def test_a_race_counts_simulations_to_the_baselines_final_cost():
     np.testing.assert_array_equal(compare.best_after(gradient, np.array([3, 4, 11, 12, 99])), [np.inf, 9, 4, 4, 1])
 
 
+def test_the_dearer_of_two_calls_is_told():
+    work = np.zeros(200_000)
+    ratio = compare.cpu_ratio(lambda n: [np.sin(work) for _ in range(20 * n)], lambda n: np.sin(work), 1)
+    assert 4 < ratio < 100
+
+
 def test_a_contest_runs_every_baseline_and_draws_it(tmp_path):
     pytest.importorskip("cma")
     report = Report(tmp_path, quick=True)
@@ -152,7 +158,7 @@ def test_a_contest_runs_every_baseline_and_draws_it(tmp_path):
         x = x - 0.1 * 2 * np.array([[1.0, 0.6], [0.0, 2.0]]) @ d
         points.append(x)
     gradient = compare.descent(SimpleNamespace(cost=costs(points), theta=np.array(points)), compare.gradient_price(2))
-    races = compare.contest(report, gradient, costs, start, LOW, HIGH, 80, "1", seeds=range(2))
+    races = compare.contest(report, gradient, costs, start, LOW, HIGH, 80, "1", 4.0, range(2))
     assert {name: len(exact) for name, (exact, _) in races.items()} == {
         "random search": 2,
         "CMA-ES": 2,

@@ -11,6 +11,7 @@ it from a cost of one point. A cost that is not finite counts as worst.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -251,11 +252,12 @@ def _trace(points, cost) -> Trace:
     return Trace(np.arange(1, len(cost) + 1), _finite(cost), points)
 
 
-def contest(report, gradient: Trace, costs: Callable, start, low, high, budget: int, unit: str, seeds=range(5)):
+def contest(report, gradient: Trace, costs: Callable, start, low, high, budget: int, unit: str, dearer: float, seeds):
     """All baselines on the cost of a gradient search: a line each, the figure `budget_figure`, and the races.
 
     Random search and CMA-ES run once for each seed; Nelder-Mead has no chance in it and, like CMA-ES, starts where
-    the gradient did. Returns, for each baseline, its races at no slack and at a slack of 1 %, two lists over seeds.
+    the gradient did. dearer: CPU time of a value and gradient in values, `cpu_ratio`, beside the count of
+    `gradient_price`. Returns, for each baseline, its races at no slack and at a slack of 1 %, two lists over seeds.
     """
     traces = {
         "gradient": [gradient],
@@ -263,21 +265,41 @@ def contest(report, gradient: Trace, costs: Callable, start, low, high, budget: 
         "CMA-ES": [cma_es(costs, start, low, high, budget, seed) for seed in seeds],
         "Nelder-Mead": [nelder_mead(costs, start, low, high, budget)],
     }
+    price = gradient.spent[0]
     report.note(
-        f"gradient: cost {gradient.cost[0]:.6g} -> {gradient.cost.min():.6g} in {gradient.spent[-1]} simulations"
+        f"gradient: cost {gradient.cost[0]:.6g} -> {gradient.cost.min():.6g} in {len(gradient.cost)} steps, each "
+        f"counted as {price:g} simulations; in CPU time it is {dearer:.3g}"
     )
     races = {}
     for name, several in list(traces.items())[1:]:
         exact, near = ([race(gradient, trace, budget, slack) for trace in several] for slack in (0.0, 0.01))
         races[name] = exact, near
         least = [r.target for r in exact]
-        line = f"{name}: least cost {np.median(least):.6g} ({min(least):.6g} to {max(least):.6g})"
-        for label, some in (("of that cost", exact), ("of 99 % of its gain", near)):
-            its, ours, fewer = (np.median([getattr(r, f) for r in some]) for f in ("baseline", "gradient", "fewer"))
-            line += f"; {label} after {its:.0f} simulations, gradient {ours:.0f}: {fewer:.2g} times fewer"
-        report.note(line)
+        report.note(f"{name}: least cost {np.median(least):.6g} ({min(least):.6g} to {max(least):.6g})")
+        for label, some in (("its final cost", exact), ("99 % of its gain", near)):
+            middle = lambda field, some=some: float(np.median([getattr(r, field) for r in some]))
+            report.note(
+                f"  {label}: after {middle('baseline'):.0f} simulations, gradient {middle('gradient'):.0f}: "
+                f"{middle('fewer'):.2g} times fewer ({middle('fewer_than_budget'):.2g} times fewer than the budget of "
+                f"{budget}; in CPU time {middle('fewer') * price / dearer:.2g} times less)"
+            )
     report.figure("budget", budget_figure(traces, budget, unit, report.experiment))
     return races
+
+
+def cpu_ratio(dear: Callable, cheap: Callable, *operands) -> float:
+    """CPU time of one call over that of another; the least of five calls each, compiled before."""
+
+    def least(f):
+        jax.block_until_ready(f(*operands))
+        spent = []
+        for _ in range(5):
+            started = time.process_time()
+            jax.block_until_ready(f(*operands))
+            spent.append(time.process_time() - started)
+        return min(spent)
+
+    return least(dear) / least(cheap)
 
 
 # the figure
