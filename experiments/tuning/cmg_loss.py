@@ -243,7 +243,7 @@ def tuned(report) -> None:
     budget = 60 if report.quick else 250
     low, high = START - np.repeat([np.log(10), 2.5], [5, 6]), START + np.repeat([np.log(10), 2.5], [5, 6])
     contest(report, descent(history, gradient_price(START.size)), one_by_one(lambda x: value(x, here)), START, low, high,
-            budget, "s", seeds=range(2))  # fmt: skip
+            budget, "s", dearer=None, seeds=range(2))  # fmt: skip
     other = momenta(CHOOSE, n)
     best = history.theta[int(np.argmin([float(value(theta, other)) for theta in history.theta]))]
     params, shift = jax.tree.map(np.asarray, design(best))

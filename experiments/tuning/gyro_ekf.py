@@ -346,7 +346,7 @@ def pid_gains(report) -> None:
     budget = 60 if report.quick else 160
     price = gradient_price(6)
     contest(report, descent(history, price), one_by_one(lambda x: cost(x, None)), np.zeros(6),
-                    np.full(6, -PID_BOX), np.full(6, PID_BOX), budget, "of the paper's gains", seeds=range(2))  # fmt: skip
+                    np.full(6, -PID_BOX), np.full(6, PID_BOX), budget, "of the paper's gains", dearer=None, seeds=range(2), figure="budget_pid")  # fmt: skip
 
     # chosen on other states
     other = drawn(CHOOSE, range(16), 2)
@@ -488,7 +488,7 @@ def noise_levels(report) -> None:
     best = history.theta[int(np.argmin(judged))]
     budget = 60 if report.quick else 300
     contest(report, descent(history, gradient_price(6)), one_by_one(lambda x: cost(x, None)), start,
-            start - 16, start + 16, budget, "nat per measurement", seeds=range(2))  # fmt: skip
+            start - 16, start + 16, budget, "nat per measurement", dearer=None, seeds=range(2), figure="budget_noise")  # fmt: skip
 
     for name, a, b, c in zip(LEVELS, PRINTED, np.exp(best), TRUE):
         report.note(f"{name:8} Table 5 {a:8.3g}, tuned {b:8.3g}, true {c:8.3g}")
