@@ -240,7 +240,7 @@ def tuned(report) -> None:
     cost = lambda theta, key: mean_cost(theta, here)
     _, history = tune(cost, START, OPTIMIZER, steps, KEY, forward=True)
     value = jax.jit(mean_cost)
-    budget = 60 if report.quick else 250
+    budget = 60 if report.quick else 160
     low, high = START - np.repeat([np.log(10), 2.5], [5, 6]), START + np.repeat([np.log(10), 2.5], [5, 6])
     contest(report, descent(history, gradient_price(START.size)), one_by_one(lambda x: value(x, here)), START, low, high,
             budget, "s", dearer=None, seeds=range(2))  # fmt: skip
@@ -251,7 +251,7 @@ def tuned(report) -> None:
     for (name, gamma), move in zip(BASES.items(), np.degrees(shift)):
         report.note(f"  {name} {list(gamma)} deg rearranged by {', '.join(f'{a:.2f}' for a in move)} deg")
 
-    n = 64 if report.quick else 512
+    n = 64 if report.quick else 256
     h = momenta(VERDICT, n)
     runs = {name: judged(design, h) for name, design in (BEFORE | {"tuned": (params, shift)}).items()}
     after = runs["tuned"]

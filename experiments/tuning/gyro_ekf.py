@@ -119,7 +119,7 @@ def least_growth(several: list[Loops], starts: int, steps: int) -> np.ndarray:
         return [matrix(loops, BOX * jnp.tanh(a), BC) for loops, a in zip(several, free)]
 
     def cost(free, key):  # of loops that have nothing to do with each other: their searches go side by side
-        return 1e3 * jnp.sum(growth_rate(jnp.stack(matrices(free)), PERIOD, 2e5))
+        return 1e3 * jnp.sum(growth_rate(jnp.stack(matrices(free)), PERIOD, 1e6))
 
     _, history = multi_start(cost, free, optax.adam(0.03), steps, jax.random.key(TUNE))
     met = jnp.concatenate([history.theta[::10].reshape(-1, len(several), 9), history.theta[-1]])
@@ -198,7 +198,7 @@ def why_not_both(report, nominal: Loops) -> None:
     # within the box the x axis alone is least unstable at the least K_I
     factors = np.exp(np.linspace(-BOX, BOX, 20001))
     alone = growth_rates(x_axis(p * factors, q * np.exp(-BOX)), T)[:, 0].min()
-    starts, steps = (16, 150) if report.quick else (64, 300)
+    starts, steps = (16, 150) if report.quick else (64, 500)
     factors = (0.0, 1.0, 3.0, 10.0)
     least = least_growth([loops(f) for f in factors], starts, steps)
     report.relative("B and C dead: least growth in the box, no products of inertia", alone, least[0], 0.02,
@@ -475,18 +475,18 @@ def honesty(aboard: Params, log: Flight):
 
 def noise_levels(report) -> None:
     """Part 3."""
-    n = 32
+    n = 16
     to_tune, to_choose = recorded(TUNE, n), recorded(CHOOSE, n)
     # Neither gain nor estimate changes when P, Q and R are all multiplied by one number; NIS tells which it should be.
     start = np.log(PRINTED * float(jnp.mean(honesty(params, to_tune)["nis"])))
     surprise = lambda theta, log: jnp.mean(honesty(filter_with(jnp.exp(theta)), log)["nll"])
     cost = lambda theta, key: surprise(theta, to_tune)
-    steps = 20 if report.quick else 40
+    steps = 20 if report.quick else 30
     optimizer = optax.adam(optax.linear_schedule(2.0, 0.02, steps), b1=0.7, b2=0.9)
     _, history = tune(cost, start, optimizer, steps, jax.random.key(TUNE), forward=True)
     judged = [float(surprise(theta, to_choose)) for theta in history.theta]
     best = history.theta[int(np.argmin(judged))]
-    budget = 60 if report.quick else 300
+    budget = 60 if report.quick else 200
     contest(report, descent(history, gradient_price(6)), one_by_one(lambda x: cost(x, None)), start,
             start - 16, start + 16, budget, "nat per measurement", dearer=None, seeds=range(2), figure="budget_noise")  # fmt: skip
 
@@ -496,7 +496,7 @@ def noise_levels(report) -> None:
     report.check("Q and R tuned / true, decades", np.zeros(5), (best / np.log(10))[known] - np.log10(TRUE[known]), 0.1,
                  "levels the readings were made with")  # fmt: skip
 
-    batches = [recorded(VERDICT + i, n) for i in range(2 if report.quick else 8)]
+    batches = [recorded(VERDICT + i, n) for i in range(2 if report.quick else 16)]
     truth = jnp.where(known, TRUE, 1e-30)
     before, after, oracle = (
         jax.tree.map(lambda *a: np.concatenate(a), *(honesty(aboard, log) for log in batches))
