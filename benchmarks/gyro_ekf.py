@@ -13,9 +13,10 @@ import numpy as np
 import jaxatt
 from benchmarks.measure import c_library, cpu_ns
 from jaxatt.engine import rk4
-from jaxatt.estimators import Belief, ekf_predict, kalman_update
 from jaxatt.faults import Reading
+from jaxatt.kalman import Belief, ekf_predict, kalman_update
 from jaxatt.mounting import along, gyro_pyramid, wheel_pyramid
+from jaxatt.study import batch
 from jaxatt.systems import gyro_ekf
 from jaxatt.vec import array, inverse, vec3
 
@@ -131,9 +132,8 @@ def discrete(params, belief, u, y):
 
 def sweep_ns(loop, score, real, n: int, ticks: int) -> float:
     """CPU ns per scenario-tick of a whole closed loop in a sweep."""
-    wide = lambda a: np.broadcast_to(np.asarray(a, real)[..., None], (*np.shape(a), n))
-    scenarios = jax.tree.map(wide, gyro_ekf.scenario)
-    single = jax.tree.map(lambda a: np.asarray(a, real), gyro_ekf.params)
+    single, one = jax.tree.map(lambda a: np.asarray(a, real), (gyro_ekf.params, gyro_ekf.scenario))
+    scenarios = batch(one, n)
     key = jax.random.key(0)
     run = lambda: jaxatt.sweep(loop, single, scenarios, key, ticks=ticks, score=score, progress=False)
     return cpu_ns(run, n * ticks, 3)

@@ -7,6 +7,7 @@ import numpy as np
 
 from benchmarks.measure import cpu_ns
 from jaxatt import sweep
+from jaxatt.study import batch
 from jaxatt.systems import star_isolation as star
 
 N, TICKS = 1024, 3000
@@ -27,9 +28,8 @@ def rows(quick: bool):
 
 def measured(system, dtype) -> float:
     """CPU time per scenario and tick [ns]."""
-    params = jax.tree.map(lambda a: np.asarray(a, dtype), star.params)
-    many = lambda a: np.broadcast_to(np.asarray(a, dtype)[..., None], (*np.shape(a), N))
-    scenarios = jax.tree.map(many, star.scenario)
+    params, one = jax.tree.map(lambda a: np.asarray(a, dtype), (star.params, star.scenario))
+    scenarios = batch(one, N)
     key = jax.random.key(0)
     return cpu_ns(
         lambda: sweep(system, params, scenarios, key, ticks=TICKS, score=star.score, progress=False), N * TICKS

@@ -1,6 +1,7 @@
 """Reproduce the papers: ``python -m experiments [NAME ...] [tune] [--quick] [--out DIR]``.
 
 With ``tune`` as the last word the named loops' gains are tuned instead, and judged against the papers'.
+``python -m experiments NAME campaign --help``: a campaign on disk of one of the loops.
 """
 
 from __future__ import annotations
@@ -20,6 +21,10 @@ STUDIES = {"tune": "experiments.tuning"}  # words that may follow the names, and
 
 
 def main() -> int:
+    if sys.argv[2:3] == ["campaign"]:
+        jax.config.update("jax_enable_x64", True)
+        jaxatt.fast_cpu()  # before the loops are imported
+        return importlib.import_module("experiments.campaigns").main(sys.argv[1], sys.argv[3:])
     parser = argparse.ArgumentParser(prog="python -m experiments", description=__doc__)
     words = f"of {', '.join(NAMES)}, none for all; then perhaps {', '.join(STUDIES)}"
     parser.add_argument("names", nargs="*", metavar="NAME", help=words)

@@ -15,10 +15,12 @@ import numpy as np
 
 import jaxatt
 from experiments.report import interval
+from jaxatt import plot
 from jaxatt.attitude import quat_from_euler, quat_rotate
 from jaxatt.faults import Fault, dead
 from jaxatt.linear import growth_rates, observability_rank, sampled
 from jaxatt.mounting import total, wheel_pyramid
+from jaxatt.study import batch
 from jaxatt.systems import gyro_ekf
 from jaxatt.systems.gyro_ekf import ANGLE, BIAS, DEG, DT, RATE, TABLE_4, WHEEL, Scenario, direct, failed, params, system
 from jaxatt.vec import Vec3, array
@@ -38,12 +40,6 @@ SOURCE = "independent NumPy implementation of the paper"
 def mask(*subsets: str) -> np.ndarray:
     """Which gyros the subsets name, (4, len(subsets))."""
     return np.array([[name in subset for subset in subsets] for name in "ABCD"])
-
-
-def lanes(scenario: Scenario, n: int, real=np.float64) -> Scenario:
-    """The same scenario n times, lanes last."""
-    wide = lambda a: np.broadcast_to(np.asarray(a, real)[..., None], (*np.shape(a), n))
-    return jax.tree.map(wide, scenario)
 
 
 def side_by_side(scenarios: list[Scenario]) -> Scenario:
@@ -85,10 +81,10 @@ def growth(report) -> None:
         return sampled(direct, params, scenario, ticks=gyro_ekf.CONTROL, states=states)
 
     for mode, told, expected in (("zero", 0.0, ZERO), ("pinv", 1.0, PINV)):
-        scenarios = lanes(still, 16)._replace(announced=np.full(16, told), gyro=failed(mask(*SUBSETS)))
+        scenarios = batch(still, 16)._replace(announced=np.full(16, told), gyro=failed(mask(*SUBSETS)))
         rates = growth_rates(matrix(scenarios), gyro_ekf.CONTROL * DT)[:, 0]
         report.check(f"growth rates of 16 subsets, `{mode}` [1/s]", np.array(expected) * 1e-6, rates, 1e-6, SOURCE)
-    turning = lanes(still._replace(h=np.array(WHEELS), announced=0.0), 16)._replace(gyro=failed(mask(*SUBSETS)))
+    turning = batch(still._replace(h=np.array(WHEELS), announced=0.0), 16)._replace(gyro=failed(mask(*SUBSETS)))
     rates = growth_rates(matrix(turning), gyro_ekf.CONTROL * DT)[[SUBSETS.index("BD"), SUBSETS.index("CD")], 0]
     report.check(
         "growth rates, BD and CD, wheels at their final momenta [1/s]", [-0.00467, -0.00341], rates, 5e-6, SOURCE
@@ -351,7 +347,9 @@ def drawn(n: int, seed: int, real) -> Scenario:
     """n days: random biases, initial rates; the rest as in Table 6."""
     rng = np.random.default_rng(seed)
     w = Vec3(*rng.uniform(-0.02, 0.02, (3, n)).astype(real) * DEG)
-    return lanes(Scenario(), n, real)._replace(w=w, bias=(rng.normal(0, 0.02, (4, n)) * DEG).astype(real))
+    return batch(jax.tree.map(lambda a: np.asarray(a, real), Scenario()), n)._replace(
+        w=w, bias=(rng.normal(0, 0.02, (4, n)) * DEG).astype(real)
+    )
 
 
 def monte_carlo(report) -> None:
@@ -566,16 +564,8 @@ def filter_figure(report, name: str, t, runs: dict) -> None:
 
 
 def table_figure(report, angle, t) -> None:
-    """The sixteen subsets: growth rates without the filter, settling with it."""
-    fig, (top, bottom) = plt.subplots(2, 1, figsize=(11, 6), sharex=True)
-    place = np.arange(16)
-    for offset, mode, rates, colour in ((-0.2, "zero", ZERO, COLOURS[0]), (0.2, "pinv", PINV, COLOURS[1])):
-        top.bar(place + offset, np.array(rates) * 1e-3, 0.4, color=colour, label=f"`{mode}`")
-    top.axhline(0, color="k", lw=0.8)
-    top.set(ylabel="growth rate [1e-3 / s]", title="without the filter: positive rates diverge")
-    top.legend()
-    bottom.bar(place, [settled(t, angle[..., i]) for i in range(16)], 0.6, color=COLOURS[2])
-    bottom.set(ylabel="settling to 0.01 deg [s]", xlabel="dead gyros", title="with the filter: all settle")
-    bottom.set_xticks(place, [s or "none" for s in SUBSETS])
-    fig.tight_layout()
-    report.figure("sixteen_subsets", fig)
+    """The sixteen subsets: growth rates without the filter (positive ones diverge), settling with it."""
+    growth = {f"no filter, `{mode}`": np.array(rates) * 1e-3 for mode, rates in (("zero", ZERO), ("pinv", PINV))}
+    settling = [settled(t, angle[..., i]) for i in range(16)]
+    axes = plot.subsets(mask(*SUBSETS).T, {"growth rate [1e-3/s]": growth, "settling with the filter [s]": settling})
+    report.figure("sixteen_subsets", axes[0].figure)

@@ -63,17 +63,17 @@ def alarm(evaluation, threshold, temperature):
 
 
 def detection(now, probability, onset, start=0.0) -> Detection:
-    """Tally delay, miss and false alarms of a `alarm` probability around a fault's onset [s].
+    """Tally delay, miss and false alarms of the probability of `alarm` around a fault's onset [s].
 
     start: when false alarms begin to count [s]. The delay is 0 for an alarm at the first tick of the fault; it is one
     tick less than `detection.soft_delay`, and can be had without keeping the run.
     """
-    before = now.t < onset
-    silent = jnp.where(before, 1, 1 - probability)
+    ill, quiet = now.t >= onset, (now.t < onset) & (now.t >= start)
+    silent = jnp.where(ill, 1 - probability, 1)
     return Detection(
-        delay=Delay(jnp.where(before, 0, now.dt * silent), silent),
-        miss=scores.mean(1 - probability, ~before),
-        false_alarms=scores.mean(probability, before & (now.t >= start)),
+        delay=Delay(jnp.where(ill, now.dt * silent, 0), silent),
+        miss=scores.mean(1 - probability, ill),
+        false_alarms=scores.mean(probability, quiet),
     )
 
 

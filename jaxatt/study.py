@@ -11,10 +11,10 @@ from math import prod
 import jax
 import jax.numpy as jnp
 import numpy as np
-from tqdm.auto import tqdm
+from tqdm import tqdm
 
 from jaxatt import check
-from jaxatt.engine import BLOCK, System, admit, block_log, block_scores, compiled, raw_key, traced
+from jaxatt.engine import BLOCK, System, admit, block_log, block_scores, compiled, one_key, traced, tree_bytes
 
 
 def sweep(system: System, params, scenarios, key, *, ticks: int, score: Callable, progress: bool | None = None):
@@ -31,35 +31,45 @@ def sweep(system: System, params, scenarios, key, *, ticks: int, score: Callable
     for what is no number or no key.
     """
     ticks, n = check.whole("ticks", ticks), check.lanes(scenarios)
-    params, scenarios = admit(system, params, scenarios)
-    key = raw_key(key)
+    check.function("score", score)
+    params, scenarios = admit(system, params, scenarios, (n,))
+    key = one_key(key)
     blocks = -(-n // BLOCK)
     if traced(params, scenarios, key):
         return _traced(system, score, ticks, params, scenarios, key, n, blocks)
+    with _bar(progress, n, " scenarios") as bar:
+        return scored(system, params, scenarios, key, ticks, score, advance=bar.update)
+
+
+def scored(system, params, scenarios, key, ticks, score, first: int = 0, advance: Callable = lambda n: None):
+    """What `sweep` gives, of admitted input: the blocks first, first + 1, ... on every local device, one host loop.
+
+    advance(n) is called when n more scenarios are done.
+    """
+    n = check.lanes(scenarios)
+    blocks = -(-n // BLOCK)
     rows, layout = _packed(scenarios)
     run = compiled(_packed_scores, 4)
     devices = jax.local_devices()
     at = [jax.device_put((params, key), device) for device in devices]
     under_way: deque = deque()
     done: list = []
-    with _bar(progress, n, " scenarios") as bar:
-        for block in range(blocks + 2 * len(devices)):
-            if block < blocks:
-                params, key = at[block % len(devices)]  # they decide where it runs
-                under_way.append(
-                    run(system, score, ticks, layout, params, key, _lanes_of(rows, block), np.int32(block))
-                )
-            if under_way and block >= 2 * len(devices) - 1:
-                done.append(jax.tree.map(np.asarray, under_way.popleft()))
-                bar.update(min(BLOCK, n - (len(done) - 1) * BLOCK))
+    for block in range(blocks + 2 * len(devices)):
+        if block < blocks:
+            params, key = at[block % len(devices)]  # they decide where it runs
+            number = np.int32(first + block)
+            under_way.append(run(system, score, ticks, layout, params, key, _lanes_of(rows, block), number))
+        if under_way and block >= 2 * len(devices) - 1:
+            done.append(jax.tree.map(np.asarray, under_way.popleft()))
+            advance(min(BLOCK, n - (len(done) - 1) * BLOCK))
     return jax.tree.map(lambda *parts: np.concatenate(parts, axis=-1)[..., :n], *done)
 
 
-def _bar(progress: bool | None, total: int, unit: str):
-    """A progress bar; progress None: on a terminal or in a notebook, and after two seconds."""
+def _bar(progress: bool | None, total: int, unit: str, done: int = 0):
+    """A progress bar of total units, some done before; progress None: on a terminal or in a notebook, after 2 s."""
     seen = sys.stderr.isatty() or "ipykernel" in sys.modules
     hidden = progress is False or (progress is None and not seen)
-    return tqdm(total=total, unit=unit, disable=hidden, delay=0 if progress else 2, leave=False)
+    return tqdm(total=total, unit=unit, initial=done, disable=hidden, delay=0 if progress else 2, leave=False)
 
 
 def _packed_scores(system, score, ticks, layout, params, key, rows, block):
@@ -121,10 +131,18 @@ def rerun(system: System, params, scenarios, key, index: int, *, ticks: int):
     index = check.whole("index", index, 0)
     if index >= n:
         check.refuse("index", f"be less than the {n} scenarios", index)
-    params, scenarios = admit(system, params, scenarios)
+    params, scenarios = admit(system, params, scenarios, (n,))
+    here = _lanes_of(jax.tree.map(np.asarray, scenarios), index // BLOCK)
+    return logged(system, params, here, one_key(key), index, ticks)
+
+
+def logged(system, params, here, key, index: int, ticks: int):
+    """What `rerun` gives, of admitted input: here are the `BLOCK` scenarios of the block that holds ``index``."""
     block, lane = divmod(index, BLOCK)
-    here = _lanes_of(jax.tree.map(np.asarray, scenarios), block)
-    return compiled(block_log, 2)(system, ticks, params, here, raw_key(key), np.int32(block), np.int32(lane))
+    operands = params, here, key, np.int32(block), np.int32(lane)
+    run = compiled(block_log, 2)
+    check.fits_memory(f"`ticks` = {ticks}", tree_bytes(run.eval_shape(system, ticks, *operands)), "ask for fewer")
+    return run(system, ticks, *operands)
 
 
 @lru_cache
@@ -142,5 +160,12 @@ def varied(system: System) -> System:
 
 
 def batch(tree, n: int):
-    """The tree with n scenarios in the last axis of every leaf that carries none, leaves of shape () or (n,)."""
-    return jax.tree.map(lambda leaf: np.broadcast_to(np.asarray(leaf), (n,)), tree)
+    """One scenario, a tree, n times: every leaf, of shape (...), gets the n scenarios as its last axis, (..., n)."""
+    n = check.whole("n", n)
+
+    def repeated(leaf):
+        if not check.is_number(leaf):
+            raise TypeError(f"`tree` must hold numbers, but it holds {check.short(leaf)}.")
+        return np.broadcast_to(np.asarray(leaf)[..., None], (*np.shape(leaf), n))
+
+    return jax.tree.map(repeated, tree)

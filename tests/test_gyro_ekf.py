@@ -1,4 +1,4 @@
-"""The gyro loop: mounting, Kalman core, linear analysis, and what the spec says the closed loop does."""
+"""The gyro loop: mounting, Kalman core, linear analysis, and what the reference says the closed loop does."""
 
 import inspect
 from functools import partial
@@ -14,10 +14,11 @@ from jaxatt import detection
 from jaxatt.attitude import euler_rate, quat_from_euler, quat_rotate
 from jaxatt.controllers import allocation
 from jaxatt.engine import System
-from jaxatt.estimators import Belief, ekf_predict, innovation, kalman_update, nees
 from jaxatt.faults import Fault, Reading
+from jaxatt.kalman import Belief, ekf_predict, innovation, kalman_update, nees
 from jaxatt.linear import growth_rates, observability_rank, sampled
 from jaxatt.mounting import along, gyro_pyramid, parity_vector, total, wheel_pyramid
+from jaxatt.study import batch
 from jaxatt.systems import gyro_ekf
 from jaxatt.systems.gyro_ekf import ANGLE, BIAS, DEG, DT, Scenario, direct, failed, params, system
 from jaxatt.vec import Vec3, array, mat3
@@ -29,10 +30,6 @@ ZERO = [-10595, -3800, -4294, -4384, -10595, 3941, 3938, -6325, 4001, -4085, -40
 PINV = [-10595, -10595, -10595, -10595, -10595, 3958, 3957, 651, 4001, 870, 823, 4001, 3952, 3952, 4001, 6285]
 MASKS = np.array([[name in s for s in SUBSETS] for name in "ABCD"])
 QUIET: dict[str, Any] = dict(std_angle=0.0, std_gyro=0.0, std_tacho=0.0)
-
-
-def lanes(scenario, n):
-    return jax.tree.map(lambda a: np.broadcast_to(np.asarray(a, float)[..., None], (*np.shape(a), n)), scenario)
 
 
 def side_by_side(*scenarios):
@@ -222,7 +219,7 @@ def test_observability_of_a_double_integrator():
 @pytest.mark.parametrize("told, expected", [(0.0, ZERO), (1.0, PINV)])
 def test_growth_rates_of_the_sixteen_subsets(told, expected):
     still = Scenario(w=Vec3(0.0, 0.0, 0.0), h=np.zeros(4), bias=np.zeros(4))
-    scenarios = lanes(still, 16)._replace(announced=np.full(16, told), gyro=failed(MASKS))
+    scenarios = batch(still, 16)._replace(announced=np.full(16, told), gyro=failed(MASKS))
     rates = growth_rates(subset_matrices(scenarios), 0.5)[:, 0]
     np.testing.assert_allclose(rates, np.array(expected) * 1e-6, atol=1e-6)
 
@@ -378,7 +375,7 @@ def test_loop_drops_the_faulty_gyro_by_itself():
     who = np.arange(n) % 4
     fault = jax.tree.map(lambda a: np.broadcast_to(np.asarray(a, float), (4, n)), Fault(bias=30e-6))
     fault = fault._replace(onset=np.where(np.arange(4)[:, None] == who, 30.0, np.inf))
-    scenarios = lanes(Scenario(), n)._replace(gyro=fault, announced=np.zeros(n))
+    scenarios = batch(Scenario(), n)._replace(gyro=fault, announced=np.zeros(n))
     alert = gyro_ekf.consistent(params)._replace(threshold=40.0)
     v = jaxatt.sweep(system, alert, scenarios, jax.random.key(1), ticks=480, score=gyro_ekf.score)
     caught = v.caught[who, np.arange(n)]

@@ -11,6 +11,7 @@ from jaxatt.bodies import body_acceleration
 from jaxatt.controllers import adapted_rate_gain, rate_gain_floor
 from jaxatt.engine import rk4
 from jaxatt.estimators import AttitudeRate, mrp_observer
+from jaxatt.study import batch
 from jaxatt.systems import observer_pd as op
 from jaxatt.vec import Vec3, array, cross, inverse, norm, vec3
 
@@ -21,17 +22,13 @@ KEY = jax.random.key(0)
 RNG = np.random.default_rng(7)
 
 
-def lanes(scenario, n):
-    return jax.tree.map(lambda a: np.full(n, a), scenario)
-
-
 def last_outside(values, bound, dt):
     return dt * np.max(np.flatnonzero(np.asarray(values) > bound))
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
 def test_the_lyapunov_identity_of_the_observer(sign):
-    """V' = -alpha |xi_q|^2 - beta |xi_w|^2 for clean readings; with noise the exact form of the spec, 5.3."""
+    """V' = -alpha |xi_q|^2 - beta |xi_w|^2 for clean readings; with noise the exact form of the reference."""
     n, J, J_inv, alpha, beta = 200, op.INERTIA, inverse(op.INERTIA), 1.1, 15.0
     draw = lambda size=1.0: vec3(size * RNG.normal(size=(3, n)))
     for noise in (0.0, 0.3):
@@ -106,7 +103,7 @@ def test_the_adaptation_step_is_the_solution_of_19():
 
 
 def windows(params, scenario, now, log):
-    """Tallies of the table of section 3 of the spec."""
+    """Tallies of the table of section 3 of the reference."""
     inside = [(now.t >= a) & (now.t < b) for a, b in ((60, 150), (150, 250), (250, 350))]
     qq, ww = log.e_q @ log.e_q, log.e_w @ log.e_w
     return [
@@ -124,7 +121,7 @@ def windows(params, scenario, now, log):
 def test_the_monte_carlo_table(eps, tolerance, table):
     system = op.system._replace(substeps=4 if eps == 0.1 else 8)
     swept = sweep(
-        system, op.params._replace(eps=eps), lanes(op.scenario, 64), jax.random.key(21), ticks=3500, score=windows
+        system, op.params._replace(eps=eps), batch(op.scenario, 64), jax.random.key(21), ticks=3500, score=windows
     )
     for got, (xi, share, q, w) in zip(swept, table):
         rms = [np.sqrt(a.mean()) for a in (got[0], got[2], got[3])]
@@ -183,7 +180,7 @@ def test_the_shadow_set_keeps_a_tumbling_body_inside_the_unit_ball():
 
 def test_scores_of_a_run_with_known_answers():
     start = QUIET._replace(gyro=on_axes(Fault(30.0, bias=0.2)))
-    swept = sweep(op.system, op.params, lanes(start, 2), KEY, ticks=500, score=op.score)
+    swept = sweep(op.system, op.params, batch(start, 2), KEY, ticks=500, score=op.score)
     assert swept.delay[0] == 0 and swept.miss[0] < 0.05
     assert swept.false_alarms[0] == 0 and swept.start_up_alarms[0] == 0
     assert swept.settling[0] == pytest.approx(5.2, abs=0.11)

@@ -12,7 +12,14 @@ import numpy as np
 import optax
 import pytest
 
-from jaxatt import System, scores, sweep
+from jaxatt import Fault, System, Vec3, on_axes, scores, simulate, sweep
+from jaxatt.controllers import Steering
+from jaxatt.objectives import alarm
+from jaxatt.systems import cmg_loss as cmg
+from jaxatt.systems import gyro_ekf as ge
+from jaxatt.systems import observer_pd as op
+from jaxatt.systems import star_isolation as si
+from jaxatt.systems import wheel_mrac as wm
 from jaxatt.tuning import (
     FEW,
     averaged,
@@ -255,3 +262,60 @@ def test_the_gradient_check_knows_a_smooth_cost_from_a_staircase():
     lying = gradient_check(stairs, 0.317, KEY, step=0.03)
     assert lying.gradient[0] == pytest.approx(0.1)
     assert abs(lying.central[0] - 0.1) > 0.2 and lying.doubt[0] > 0.2 and lying.relative[0] > 1
+
+
+def observer_pd(theta, key):
+    p = op.params._replace(**{k: getattr(op.params, k) * jnp.exp(v) for k, v in theta.items() if k != "size"})
+    scenario = op.scenario._replace(
+        q_hat=Vec3(0.35, 0.2, -0.6), gyro=on_axes(Fault(1.0, drift=0.1 * jnp.exp(theta["size"])))
+    )
+    log = simulate(op.system, p, scenario, key, ticks=40)
+    return jnp.mean(log.e_q @ log.e_q) + 1e-6 * jnp.mean(log.u @ log.u) + 1e-2 * jnp.mean(alarm(log.xi, p.sigma, 0.01))
+
+
+def gyro_ekf_pid(theta, key):
+    """The loop as shipped, its Kalman filter included."""
+    scaled = {k: jnp.exp(v) * Vec3(*map(jnp.asarray, getattr(ge.params, k))) for k, v in theta.items() if k != "R"}
+    p = ge.params._replace(**scaled, R=jnp.exp(theta["R"]) * jnp.asarray(ge.params.R))
+    log = simulate(ge.system, p, ge.scenario, key, ticks=16)
+    return 1e9 * jnp.mean(log.angle @ log.angle) + 1e6 * jnp.mean(log.w @ log.w)
+
+
+def cmg_steering(theta, key):
+    p = cmg.Params(
+        k_p=0.2 * jnp.exp(theta["k_p"]), k_i=0.02 * jnp.exp(theta["k_i"]),
+        steering=Steering(lam0=0.01 * jnp.exp(theta["lam0"]), dither=0.1),
+    )  # fmt: skip
+    log = simulate(cmg.system._replace(substeps=1), p, cmg.scenario, key, ticks=20)
+    return jnp.mean(log.w @ log.w) + 1e-3 * jnp.mean(log.acceleration)
+
+
+def star_filters(theta, key):
+    p = si.params._replace(**{k: getattr(si.params, k) * jnp.exp(v) for k, v in theta.items()})
+    log = simulate(si.system, p, si.scenario, key, ticks=16)
+    return jnp.mean(log.nees) + 1e4 * jnp.mean(log.w @ log.w)
+
+
+def wheel_adaptation(theta, key):
+    p = wm.params._replace(
+        K=jnp.exp(theta["K"]), law=wm.params.law._replace(gamma=1e-6 * jnp.exp(theta["gamma"])),
+        P0=1e-6 * jnp.exp(theta["P0"]),
+    )  # fmt: skip
+    log = simulate(wm.loop(substeps=8), p, wm.scenario, key, ticks=60)
+    return jnp.mean(log.error**2) + 1e-8 * jnp.mean(log.step**2)
+
+
+@pytest.mark.parametrize(
+    ("cost", "names"),
+    [
+        (observer_pd, "alpha beta sigma k_q k_w0 size"),
+        (gyro_ekf_pid, "k_p k_i k_d R"),
+        (cmg_steering, "k_p k_i lam0"),
+        (star_filters, "std_gyro std_star bandwidth damping"),
+        (wheel_adaptation, "K gamma P0"),
+    ],
+)
+def test_every_loops_gradient_equals_the_central_difference(cost, names):
+    found = gradient_check(cost, {name: 0.03 for name in names.split()}, KEY)
+    assert (np.abs(found.central) > 0).all()
+    assert found.relative.max() < 1e-5, found

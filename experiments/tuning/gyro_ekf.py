@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from experiments.gyro_ekf import COLOURS, SUBSETS, lanes, mask
+from experiments.gyro_ekf import COLOURS, SUBSETS, mask
 from experiments.report import plt
 from experiments.tuning.compare import (
     contest,
@@ -35,6 +35,7 @@ from jaxatt.engine import Now
 from jaxatt.linear import growth_rates, sampled
 from jaxatt.mounting import total
 from jaxatt.objectives import growth_rate, penalty
+from jaxatt.study import batch
 from jaxatt.systems import gyro_ekf
 from jaxatt.systems.gyro_ekf import CONTROL, DEG, DT, INERTIA, Params, Scenario, direct, failed, params
 from jaxatt.tuning import multi_start
@@ -84,7 +85,7 @@ def at_rest(J: Mat3) -> Scenario:
     """A satellite at rest with inertia J, for every subset; a dead gyro reads zero."""
     none = np.zeros(4)
     still = Scenario(w=Vec3(0.0, 0.0, 0.0), h=none, bias=none, announced=0.0, J=J)
-    return lanes(still, 16)._replace(gyro=failed(mask(*SUBSETS)))
+    return batch(still, 16)._replace(gyro=failed(mask(*SUBSETS)))
 
 
 def loops(coupling: float = 1.0) -> Loops:
@@ -234,7 +235,7 @@ def drawn(seed: int, subsets, n: int) -> Scenario:
     """
     rng, m = np.random.default_rng([seed, 7]), len(subsets)
     normal = lambda *shape: np.tile(rng.normal(size=(*shape, n)), m)
-    return lanes(Scenario(), m * n)._replace(
+    return batch(Scenario(), m * n)._replace(
         angle=Vec3(*(0.03 * DEG * normal(3))),
         w=Vec3(*(0.02 * DEG * normal(3))),
         h=10.0 * normal(4),
@@ -446,7 +447,7 @@ def replayed(aboard: Params, log: Flight):
     Shapes (ticks, lanes) and, of the errors, (ticks, 3, lanes). The recorded command is the one the wheels followed.
     """
     n = log.u.shape[-1]
-    _, z = jax.vmap(gyro_ekf.init, in_axes=(None, -1), out_axes=-1)(aboard, lanes(Scenario(), n))
+    _, z = jax.vmap(gyro_ekf.init, in_axes=(None, -1), out_axes=-1)(aboard, batch(Scenario(), n))
 
     def tick(board, now_and_log):
         k, y, u = now_and_log

@@ -3,7 +3,8 @@
 A spacecraft at zero total momentum turns because the momentum of its control moment gyros (CMG) has to go
 somewhere. One module fails: its gimbal is stopped and its wheel runs down. The others shall stop the turning by
 PI control of the body rate and a steering law. At a singularity of the remaining modules they lock or shake.
-The plant is integrated at 1 ms, logs and scores see 10 ms, control runs every 0.1 s.
+The plant is integrated at 1 ms, logs and scores see 10 ms, control runs every 0.1 s. Choices
+and errata by number: docs/loops/cmg_loss.md.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ class Params(NamedTuple):
     """What the engineer ships."""
 
     k_p: Any = 0.2  # () [1/s] rate gain, eq. (7)
-    k_i: Any = 0.02  # () [1/s^2] integral gain as printed in Table 4, which contradicts Table 5 (spec, 6): `table5`
+    k_i: Any = 0.02  # () [1/s^2] integral gain as printed in Table 4, which contradicts Table 5 (erratum 7): `table5`
     steering: Steering = Steering()
     J: Mat3 = Mat3(Vec3(50.0, 0.0, 0.0), Vec3(0.0, 50.0, 0.0), Vec3(0.0, 0.0, 30.0))  # [kg m^2] believed, J_S
     module: ModuleInertia = MODULE  # believed
@@ -48,7 +49,7 @@ class Failure(NamedTuple):
 
     onset: Any  # [s] inf for a healthy module
     brake: Any  # [N m s] b_r: the wheel runs down with time constant I_ws / b_r; 0: it spins on
-    free: Any  # 1: the gimbal's drive lets go and the gimbal swings, 0: it holds the gimbal
+    free: Any  # [1] 1: the gimbal's drive lets go and the gimbal swings, 0: it holds the gimbal
     friction: Any  # [N m s] of a free gimbal
 
 
@@ -65,7 +66,7 @@ class Scenario(NamedTuple):
     J: Mat3 = Params().J  # [kg m^2] true inertia of the spacecraft without modules
     module: ModuleInertia = MODULE  # true
     tau_g: Any = 0.05  # () [s] lag of the gimbal rates
-    u_max: Any = 1.0  # () [rad/s] limit of the gimbal rates; printed with rad/s^2 (spec, 2)
+    u_max: Any = 1.0  # () [rad/s] limit of the gimbal rates; printed with rad/s^2 (erratum 3)
     std_w: Any = 0.0  # () [rad/s] gyro noise per axis
     bias_w: Vec3 = Vec3(0.0, 0.0, 0.0)  # [rad/s] gyro bias
 
@@ -91,7 +92,7 @@ class Drive(NamedTuple):
 
     u: Any  # [rad/s] gimbal-rate command after the limit
     brake: Any  # [N m s]
-    free: Any  # 1 or 0
+    free: Any  # [1] 1 or 0
 
 
 class X(NamedTuple):
@@ -142,9 +143,9 @@ class Scores(NamedTuple):
     final: Any  # [rad/s] |w| at the end
     start: Any  # [rad/s] |w| at the start
     momentum: Any  # [N m s] |total momentum| at the end
-    rank_one: Any  # rank one of the torque matrix was met
-    absorbable: Any  # the start's total momentum lies within the hull of what the healthy modules can hold
-    ok: Any  # rate, momentum and gimbal rates were finite
+    rank_one: Any  # bool, rank one of the torque matrix was met
+    absorbable: Any  # bool, the start's total momentum lies within the hull of what the healthy modules can hold
+    ok: Any  # bool, rate, momentum and gimbal rates were finite
 
 
 def init(params: Params, scenario: Scenario):
@@ -251,13 +252,14 @@ def score(params: Params, scenario: Scenario, now, log: Log) -> Scores:
 
 
 def classify(run: Scores):
-    """The class of a run (spec, 6): `FLUCTUATION` of the gimbals, `LOCK` of the rate, or `PROPER`."""
+    """The class of a run (choice 2): `FLUCTUATION` of the gimbals, `LOCK` of the rate, or `PROPER`."""
     variation, ratio = np.asarray(run.variation), np.asarray(run.final) / np.asarray(run.start)
     return np.where(~(variation <= 20), FLUCTUATION, np.where(ratio > 0.2, LOCK, PROPER))
 
 
-def refuse_bad(params: Params, scenario: Scenario) -> None:
-    """The system's check: ValueError on input outside physics' domain."""
+def refuse_bad(params: Params, scenario: Scenario) -> tuple:
+    """The system's check: ValueError on input outside physics' domain; returns the lanes."""
+    lanes = check.shapes(params, scenario, Params(), _shaped(scenario))
     check.moments("params.J", params.J)
     check.moments("scenario.J", scenario.J)
     for name in ("k_p", "k_i"):
@@ -281,6 +283,19 @@ def refuse_bad(params: Params, scenario: Scenario) -> None:
         check_gimbal_axes("scenario.axes", scenario.axes, np.isinf(np.asarray(scenario.failure.onset)))
         if scenario.known is not None:
             check_gimbal_axes("scenario.known", scenario.known)
+    return lanes
+
+
+def _shaped(scenario: Scenario) -> Scenario:
+    """A scenario of the shapes that this one must have, for as many modules as it has gimbal angles."""
+    check.kind("scenario", scenario, Scenario)
+    n = np.shape(scenario.gamma)[:1]
+    if not n:
+        check.refuse("scenario.gamma", "have shape (n, *lanes)", "()")
+    each = np.zeros(n)
+    axes = GimbalAxes(Vec3(each, each, each), Vec3(each, each, each))
+    known = None if scenario.known is None else axes
+    return Scenario(each, Failure(each, each, each, each), axes, known, each, each)
 
 
 def lost(skew, gamma, module: int = 3, onset=0.0, brake=1e-6, free=0.0, friction=0.0) -> Scenario:
