@@ -98,7 +98,7 @@ def test_the_smooth_growth_rate_bounds_the_largest_one():
 
 
 def test_the_margins_of_the_papers_proof():
-    """Spec, 4 and 5.7: k_q = 330 needs eps > 0.00303032; T_I at the start is 31.7 for eps = 0.1, -0.0206 for 0.00304."""
+    """From an independent implementation: k_q = 330 needs eps > 0.00303032; T_I at the start is 31.7 for eps = 0.1, -0.0206 for 0.00304."""
     largest, q, w = 31.8566039, 0.76533, 1.30721
     m = op.margins(op.params, largest, q, w)
     assert abs(m.T - 31.7) < 0.05 and m.eps == pytest.approx(0.354348 - 0.1, abs=1e-6)
