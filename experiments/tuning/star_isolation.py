@@ -68,7 +68,7 @@ def run(report) -> None:
 # scenarios
 
 
-def world(n: int, seed: int, onset=ONSET * DT):
+def world(n: int, seed: int, onset: Any = ONSET * DT):
     """n scenarios with a fault of 2 to 5 noise deviations of one star sensor, either sign; and which sensor."""
     rng = np.random.default_rng(seed)
     faulty = rng.integers(2, size=n)
@@ -109,20 +109,24 @@ def evaluated(numbers, data: Recorded):
     return detection.soft_windowed(nis, window, LONGEST)
 
 
-def each_terms(numbers, data: Recorded, temperature=TEMPERATURE, hard: bool = False):
-    """Delay [s] and share of false alarms of every run, shape (n,) each; hard: by steps, with no gradient."""
-    J, threshold = evaluated(numbers, data), threshold_of(*numbers[:2])
-    p = 1.0 * (threshold < J) if hard else detection.soft_alarm(J, threshold, temperature)
-    first = data.faulty == ROLL
+def terms_of(p, faulty):
+    """Delay [s] and share of false alarms of every run, shape (n,) each, from alarms p, (END - 1, 2, n), 0 to 1."""
+    first = faulty == ROLL
     own, other = jnp.where(first, p[:, ROLL], p[:, PITCH]), jnp.where(first, p[:, PITCH], p[:, ROLL])
     quiet = jnp.concatenate([own[SETTLED : ONSET - 1], other[SETTLED:]])  # what should be silent
     return detection.soft_delay(own[ONSET - 1 :], DT), jnp.mean(quiet, axis=0)
 
 
-def each_cost(numbers, data: Recorded, temperature=TEMPERATURE, hard: bool = False):
-    """Cost [s] of every run, shape (n,)."""
-    delay, false = each_terms(numbers, data, temperature, hard)
+def cost_of(delay, false):
+    """Cost [s] of every run."""
     return delay + WEIGHT * false
+
+
+def each_cost(numbers, data: Recorded, temperature=TEMPERATURE, hard: bool = False):
+    """Cost [s] of every run, shape (n,); hard: by steps, with no gradient."""
+    J, threshold = evaluated(numbers, data), threshold_of(*numbers[:2])
+    p = 1.0 * (threshold < J) if hard else detection.soft_alarm(J, threshold, temperature)
+    return cost_of(*terms_of(p, data.faulty))
 
 
 def tuning_cost(numbers, data: Recorded, temperature=TEMPERATURE):
@@ -196,8 +200,8 @@ def verdict(report, chosen, n: int) -> None:
     table = {}
     for name, s in results.items():
         delay = of(s["delay"])
-        cause = detection.isolate_first(*s["delay"], PATIENCE)
-        by_luck = detection.isolate_first(*s["luck"], PATIENCE)
+        cause = detection.isolate_first(s["delay"][ROLL], s["delay"][PITCH], PATIENCE)
+        by_luck = detection.isolate_first(s["luck"][ROLL], s["luck"][PITCH], PATIENCE)
         table[name] = dict(
             miss=~np.isfinite(delay),
             delay=np.minimum(np.where(np.isfinite(delay), delay, np.inf), WITHIN),
