@@ -260,7 +260,8 @@ def contest(
 
     Random search and CMA-ES run once for each seed; Nelder-Mead has no chance in it and, like CMA-ES, starts where
     the gradient did. dearer: CPU time of a value and gradient in values, `cpu_ratio`, beside the count of
-    `gradient_price`; None: not measured. figure: name of the figure. Returns, for each baseline, its races at no slack and at a slack of 1 %, two lists over seeds.
+    `gradient_price`; None: not measured. figure: name of the figure. Returns, for each baseline, its races at no slack
+    and at a slack of 1 %, two lists over seeds.
     """
     traces = {
         "gradient": [gradient],
