@@ -252,12 +252,16 @@ def _trace(points, cost) -> Trace:
     return Trace(np.arange(1, len(cost) + 1), _finite(cost), points)
 
 
-def contest(report, gradient: Trace, costs: Callable, start, low, high, budget: int, unit: str, dearer: float, seeds):
+def contest(
+    report, gradient: Trace, costs: Callable, start, low, high, budget: int, unit: str, dearer: float | None, seeds,
+    figure: str = "budget",
+):  # fmt: skip
     """All baselines on the cost of a gradient search: a line each, the figure `budget_figure`, and the races.
 
     Random search and CMA-ES run once for each seed; Nelder-Mead has no chance in it and, like CMA-ES, starts where
     the gradient did. dearer: CPU time of a value and gradient in values, `cpu_ratio`, beside the count of
-    `gradient_price`. Returns, for each baseline, its races at no slack and at a slack of 1 %, two lists over seeds.
+    `gradient_price`; None: not measured. figure: name of the figure. Returns, for each baseline, its races at no slack
+    and at a slack of 1 %, two lists over seeds.
     """
     traces = {
         "gradient": [gradient],
@@ -268,7 +272,7 @@ def contest(report, gradient: Trace, costs: Callable, start, low, high, budget: 
     price = gradient.spent[0]
     report.note(
         f"gradient: cost {gradient.cost[0]:.6g} -> {gradient.cost.min():.6g} in {len(gradient.cost)} steps, each "
-        f"counted as {price:g} simulations; in CPU time it is {dearer:.3g}"
+        f"counted as {price:g} simulations" + (f"; in CPU time it is {dearer:.3g}" if dearer else "")
     )
     races = {}
     for name, several in list(traces.items())[1:]:
@@ -286,10 +290,10 @@ def contest(report, gradient: Trace, costs: Callable, start, low, high, budget: 
                 report.note(line + f"never in its {gradient.spent[-1]:.0f}")
                 continue
             report.note(
-                f"{line}after {ours:.0f}: {fewer:.2g} times fewer, {less:.2g} times fewer than the budget of {budget}; "
-                f"in CPU time {fewer * price / dearer:.2g} times less"
+                f"{line}after {ours:.0f}: {fewer:.2g} times fewer, {less:.2g} times fewer than the budget of {budget}"
+                + (f"; in CPU time {fewer * price / dearer:.2g} times less" if dearer else "")
             )
-    report.figure("budget", budget_figure(traces, budget, unit, report.experiment))
+    report.figure(figure, budget_figure(traces, budget, unit, report.experiment))
     return races
 
 
