@@ -29,7 +29,7 @@ TICKS = 400  # 40 s: a slew, a gyro fault that grows from 15-20 s on, a star-sen
 QUIET_FROM = 5.0  # [s] from here to the onset an alarm is a false one; the observer converges meanwhile
 TEMPERATURE = 0.1  # [1] of the smooth alarm, in thresholds
 N = 128  # scenarios of a cost
-RATE = 0.1  # of Adam at the start; it falls to a twentieth
+RATE = 0.08  # of Adam at the start; it falls to a twentieth
 LAMBDA = 31.8566039  # [kg m^2] largest principal moment of the believed inertia
 TUNING, CHOICE, VERDICT = (jax.random.key(seed) for seed in (2030, 2031, 2032))
 PAPER = dict(alpha=1.1, beta=15.0, sigma=0.01, k_q=330.0, k_w0=125.0)
@@ -157,18 +157,22 @@ def cost_of(free, key, reference: dict, case):
     proof = op.margins(op.params._replace(**gains), LAMBDA)
     held = sum(penalty(t[name] - 0.96) for name in HELD) + penalty(t["post_u"] - case[-1])
     held = held + penalty(1 - proof.k_q) + penalty(0.1 - proof.T)
-    return weighted(t, dict(zip(WEIGHTS, case))) + 300 * held
+    return weighted(t, dict(zip(WEIGHTS, case))) + 100 * held
 
 
 def search(reference: dict, cases: np.ndarray, steps: int, save):
-    """All cases side by side, from the paper's gains, on other scenarios at every step; gains, and the history."""
+    """All cases side by side, on other scenarios at every step; gains, and the history.
+
+    From the hand-picked gains: their overshoot stays within the band of the settling time. From the paper's, which
+    do not overshoot, the search ends where the first overshoot reaches that band.
+    """
 
     def cost(theta, key):  # the case rides along: its gradient is zero, so no step moves it
         case = jax.lax.stop_gradient(theta["case"]).astype(int)
         return cost_of(theta["free"], key, reference, jnp.asarray(cases)[case])
 
     n = len(cases)
-    free = jax.tree.map(lambda a: jnp.full(n, a), BOUNDS.free(PAPER))
+    free = jax.tree.map(lambda a: jnp.full(n, a), BOUNDS.free(BY_HAND))
     rate = optax.cosine_decay_schedule(RATE, steps, 0.05)
     _, history = multi_start(cost, dict(free=free, case=np.arange(n, dtype=float)), optax.adam(rate), steps, TUNING,
                              fresh=True, save=save)  # fmt: skip
@@ -214,7 +218,11 @@ def each_judged(gains: dict, n: int) -> dict:
         varied(op.system), (), (params, repeated), key, ticks=TICKS, score=lambda _, pair, *a: score(*pair, *a)
     )
     judged = hard(swept, repeated) | dict(ok=swept["ok"])
-    return {name: np.mean(a.reshape(sets, n), axis=1) for name, a in judged.items()}
+    # the paper's own slew, on a finer grid of ticks
+    settling = lambda _, pair, now, log: scores.settling(now, norm(log.e_q) > 0.01)
+    pairs = batch(op.params, sets)._replace(**gains), batch(QUIET, sets)
+    slew = sweep(varied(FINE._replace(dt=0.02)), (), pairs, key, ticks=600, score=settling)
+    return {name: np.mean(a.reshape(sets, n), axis=1) for name, a in judged.items()} | dict(slew=slew)
 
 
 def fronts(report, reference: dict, found: list[dict]) -> dict:
@@ -225,7 +233,7 @@ def fronts(report, reference: dict, found: list[dict]) -> dict:
     every = {name: np.concatenate([drawn_gains[name], [g[name] for g in points]]) for name in PAPER}
     judged = each_judged(every, n)
     at = {name: values[sets] for name, values in judged.items()}  # the paper's
-    kept = np.all([judged[name] <= at[name] for name in ("rms_u", "peak_u", "transient", "settling")], axis=0)
+    kept = np.all([judged[name] <= at[name] for name in ("rms_u", "peak_u", "transient", "settling", "slew")], axis=0)
     quiet = judged["false_alarms"] <= at["false_alarms"]
     price = np.where(kept & quiet & (judged["ok"] == 1), priced(judged, at), np.inf)
     best = int(np.argmin(price[:sets]))
@@ -241,10 +249,10 @@ def fronts(report, reference: dict, found: list[dict]) -> dict:
 
     tracking, detection = ("post_q", "post_u"), ("delay", "false_alarms")
     others = [*np.flatnonzero(kept[:sets]), sets, sets + 1]
-    report.within("random and hand-picked sets that dominate balanced", None, 0, better(balanced, tracking, others),
-                  "error and torque")  # fmt: skip
-    report.within("the same for watchful", None, 0, better(watchful, detection, [*range(sets), sets, sets + 1]),
-                  "delay and false alarms")  # fmt: skip
+    report.within("sets no worse elsewhere that dominate balanced", None, 0, better(balanced, tracking, others),
+                  "error, torque; random, by hand")  # fmt: skip
+    report.within("sets that dominate watchful", None, 0, better(watchful, detection, [*range(sets), sets, sets + 1]),
+                  "delay, false alarms; random, by hand")  # fmt: skip
     fig, axes = plt.subplots(1, 2, figsize=(11, 4.6), layout="constrained")
     first = sets + 2 + len(TUNED)
     lines = {tracking: range(first, len(price))[: len(TRACKING)], detection: range(first, len(price))[len(TRACKING) :]}
@@ -264,7 +272,14 @@ def fronts(report, reference: dict, found: list[dict]) -> dict:
             inside = np.arange(sets)
         ax.scatter(judged[x][inside], show(inside), s=10, color="0.45", label="random")
         front = sorted([*lines[(x, y)], balanced if y == "post_u" else watchful], key=lambda i, x=x: judged[x][i])
-        ax.plot(judged[x][front], show(front), "o-", ms=5, color=BLUE, label="tuned, weights varied")
+        ax.plot(
+            judged[x][front],
+            show(front),
+            "o-" if y == "post_u" else "o",
+            ms=5,
+            color=BLUE,
+            label="tuned, weights varied",
+        )
         for i, marker, colour, name in (
             (sets, "s", ORANGE, "the paper's"), (sets + 1, "D", PINK, "picked by hand"), (best, "v", "k", "best random"),
             (balanced, "*", GREEN, "balanced"), (watchful, "P", GREEN, "watchful"),
