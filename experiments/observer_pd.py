@@ -11,10 +11,9 @@ import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
-import optax
 
 from experiments.report import interval
-from jaxatt import Fault, Vec3, on_axes, rerun, scores, simulate, sweep, tune
+from jaxatt import Fault, Vec3, objectives, on_axes, rerun, scores, simulate, sweep
 from jaxatt.attitude import mrp_matrix, mrp_rate, mrp_rate_transposed
 from jaxatt.bodies import body_acceleration
 from jaxatt.engine import rk4
@@ -39,7 +38,6 @@ def run(report) -> None:
     figures(report)
     monte_carlo(report)
     fault_sizes(report)
-    tuning(report)
 
 
 def mathematics(report) -> None:
@@ -94,15 +92,12 @@ def gains(theta):
     return op.params._replace(alpha=alpha, beta=beta, k_q=k_q, k_w0=k_w0)
 
 
-def alarm_level(xi):
-    """A smooth stand-in of the alarm |xi| > 0.01."""
-    return jax.nn.sigmoid((xi - 0.01) / 0.001)
-
-
 def smooth_loss(theta, scenario):
     """A smooth loss of one run of 15 s."""
     log = simulate(op.system, gains(theta), scenario, KEY, ticks=150)
-    return jnp.mean(alarm_level(log.xi) + 20 * norm(log.e_q)) + 0.02 * jnp.sqrt(jnp.mean(log.u @ log.u))
+    return jnp.mean(objectives.alarm(log.xi, 0.01, 0.001) + 20 * norm(log.e_q)) + 0.02 * jnp.sqrt(
+        jnp.mean(log.u @ log.u)
+    )
 
 
 def last_outside(values, bound: float, dt: float) -> float:
@@ -259,78 +254,3 @@ def fault_sizes(report) -> None:
     # A constant star-sensor bias is absorbed (DC gain 0), whatever its size: reference.
     star = by_case.miss[[k for k, c in enumerate(cases) if c[0] == "star" and c[1] == "bias"]]
     report.within("least miss share, constant star-sensor bias", 0.5, None, star.mean(1).min(), "DC gain 0, reference")
-
-
-def tuning_scenarios(n: int, seed: int):
-    """Slews of 60 s with a gyro bias at 20 s, a random star-sensor fault at 40 s, a wrong start of the observer."""
-    rng = np.random.default_rng(seed)
-    scenarios = batch(op.scenario, n)
-    shaken = lambda v: Vec3(*(a + 0.05 * rng.normal(size=n) for a in v))
-    faults = lambda f: batch(on_axes(f), n)
-    return scenarios._replace(
-        q_hat=shaken(scenarios.q), w_hat=shaken(scenarios.w),
-        gyro=faults(Fault(20.0, bias=0.02)), star=faults(Fault(40.0, random=0.01)),
-    )  # fmt: skip
-
-
-def tuning_score(params, scenario, now, log):
-    """Soft alarms and tracking, the terms of the tuned cost, and the hard alarms by which it is judged."""
-    level = alarm_level(log.xi)
-    quiet, ill = (now.t >= 5) & (now.t < 20), now.t >= 20
-    return dict(
-        soft_false=scores.mean(level, quiet),
-        soft_miss=scores.mean(1 - level, ill),
-        post=scores.mean(norm(log.e_q), ill),
-        transient=scores.mean(norm(log.e_q), ~ill),
-        rms_u=scores.rms(log.u @ log.u),
-        rms_u_ill=scores.rms(log.u @ log.u, ill),
-        miss=scores.mean(~log.alarm, ill),
-        false=scores.mean(log.alarm, (now.t >= 10) & ~ill),
-        early=scores.mean(log.alarm, (now.t >= 5) & (now.t < 10)),
-    )
-
-
-def tuning_cost(theta, key, scenarios, weight: float):
-    """The cost of the gains exp(theta): weight on soft false alarms."""
-    s = sweep(op.system, gains(theta), scenarios, key, ticks=600, score=tuning_score)
-    each = (
-        weight * s["soft_false"]
-        + s["soft_miss"]
-        + 20 * s["post"]
-        + 10 * s["transient"]
-        + 0.02 * s["rms_u"]
-        + 0.2 * s["rms_u_ill"]
-    )
-    return jnp.mean(each)
-
-
-def tuning(report) -> None:
-    """Gains by gradient, judged on scenarios and noise that the search has not met."""
-    start = np.log([1.1, 15.0, 330.0, 125.0])
-    train = tuning_scenarios(128, 99)
-    cost = lambda theta, key: tuning_cost(theta, key, train, 100.0)
-    theta, history = tune(cost, start, optax.adam(0.05), 60, jax.random.fold_in(KEY, 2))
-    n = 128 if report.quick else 1024
-    fresh, key = tuning_scenarios(n, 2021), jax.random.fold_in(KEY, 4)
-    before, after = (sweep(op.system, gains(t), fresh, key, ticks=600, score=tuning_score) for t in (start, theta))
-    report.note("tuned alpha, beta, k_q, k_w0: " + ", ".join(f"{a:.4g}" for a in np.exp(theta)))
-    for name in ("miss", "false", "early", "post", "transient", "rms_u", "rms_u_ill"):
-        change = after[name] - before[name]
-        half = 1.96 * change.std(ddof=1) / np.sqrt(n)
-        report.note(
-            f"{name:10} {before[name].mean():9.5f} -> {after[name].mean():9.5f}  paired change {change.mean():+.5f} +- {half:.5f}"
-        )
-    gain = lambda name: float(after[name].mean() / before[name].mean())
-    report.within("tuned / paper's gains, |e_q| after the fault", None, 0.75, gain("post"), f"{n} fresh scenarios")
-    report.within(
-        "tuned / paper's gains, rms torque after the fault", None, 0.85, gain("rms_u_ill"), f"{n} fresh scenarios"
-    )
-    report.within("tuned: false alarms after 10 s", None, 0.001, float(after["false"].mean()), f"{n} fresh scenarios")
-    fig, (left, right) = plt.subplots(1, 2, figsize=(9, 3.5), layout="constrained")
-    left.plot(history.cost)
-    left.set(xlabel="step of the search", ylabel="cost on the training scenarios")
-    for name, values in zip((r"$\alpha$", r"$\beta$", "$k_q$", "$k_{w0}$"), np.exp(history.theta - start).T):
-        right.plot(values, label=name)
-    right.set(xlabel="step of the search", ylabel="gain / the paper's", yscale="log")
-    right.legend()
-    report.figure("tuning", fig)

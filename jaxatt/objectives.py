@@ -77,6 +77,37 @@ def detection(now, probability, onset, start=0.0) -> Detection:
     )
 
 
+# settling
+
+
+class SoftSettling(NamedTuple):
+    """Expected last time [s] outside a band, counted from the start of a window; 0 if it was never left."""
+
+    time: Any = 0.0  # [s]
+    inside: Any = 1.0  # [1] probability of not having been outside
+    length: Any = 0.0  # [s] of the window so far
+
+    def __add__(self, later):
+        return SoftSettling(
+            self.length - later.inside * (self.length - self.time) + later.time,
+            self.inside * later.inside,
+            self.length + later.length,
+        )
+
+    def value(self):
+        return self.time
+
+
+def settling(now, outside, inside: Any = True) -> SoftSettling:
+    """Tally a smooth settling time [s]; outside: probability of being outside the band, `alarm` of the error.
+
+    The plain sum of ``outside`` would not see that an overshoot leaves the band once more, late but briefly.
+    """
+    out = jnp.where(inside, outside, 0)
+    length = jnp.where(inside, now.dt * jnp.ones_like(out), 0)
+    return SoftSettling(length * out, 1 - out, length)
+
+
 # chatter
 
 

@@ -38,14 +38,18 @@ def value_and_gradient(cost: Callable, theta, key, *, forward: bool | None = Non
     Raises TypeError if the cost is no scalar.
     """
     flat, unravel = ravel_pytree(theta)
-    shape = jax.eval_shape(cost, theta, key).shape
-    if shape != ():
-        raise TypeError(f"`cost` must be a scalar, but its shape is {shape}.")
+    _scalar(cost, theta, key)
     if not (flat.size <= FEW if forward is None else forward):
         return jax.value_and_grad(cost)(theta, key)
     along = lambda direction: jax.jvp(lambda a: cost(unravel(a), key), (flat,), (direction,))
     value, slopes = jax.vmap(along, out_axes=(None, 0))(jnp.eye(flat.size, dtype=flat.dtype))
     return value, unravel(slopes)
+
+
+def _scalar(cost: Callable, theta, key) -> None:
+    shape = jax.eval_shape(cost, theta, key).shape
+    if shape != ():
+        raise TypeError(f"`cost` must be a scalar, but its shape is {shape}.")
 
 
 # the search
@@ -272,7 +276,7 @@ class Bounds(NamedTuple):
 def bounded(low, high) -> Bounds:
     """Bounds as a change of variables: any step of an optimizer on ``free(theta)`` stays in (low, high).
 
-    low, high: trees like theta, or single numbers for all of it; -inf and inf leave a side open. A positive number
+    low, high: trees like theta, or single numbers for all of it; -inf and inf leave a side open, a leaf's at once. A positive number
     is ``bounded(0, inf)``: the logarithm. Between two positive bounds a number moves in ratios, between others in
     differences; in both cases 0 is the middle.
 
@@ -298,24 +302,34 @@ def bounded(low, high) -> Bounds:
 def _free(low, high, a, path):
     if check.concrete(a):
         check.each(f"theta{path}", f"lie in ({low}, {high})", a, (np.asarray(a) > low) & (np.asarray(a) < high))
-    if np.isinf(high):
-        return jnp.asarray(a) if np.isinf(low) else jnp.log(a - low)
-    if np.isinf(low):
+    no_low, no_high = _absent("low", low, path), _absent("high", high, path)
+    if no_high:
+        return jnp.asarray(a) if no_low else jnp.log(a - low)
+    if no_low:
         return -jnp.log(high - a)
-    if low > 0:
+    if np.all(np.asarray(low) > 0):
         low, high, a = np.log(low), np.log(high), jnp.log(a)
     return jnp.log((a - low) / (high - a))
 
 
 def _within(low, high, a, path):
-    if np.isinf(high):
-        return jnp.asarray(a) if np.isinf(low) else low + jnp.exp(a)
-    if np.isinf(low):
+    no_low, no_high = _absent("low", low, path), _absent("high", high, path)
+    if no_high:
+        return jnp.asarray(a) if no_low else low + jnp.exp(a)
+    if no_low:
         return high - jnp.exp(-a)
     share = jax.nn.sigmoid(a)
-    if low > 0:
+    if np.all(np.asarray(low) > 0):
         return jnp.exp(np.log(low) + (np.log(high) - np.log(low)) * share)
     return low + (high - low) * share
+
+
+def _absent(name: str, bound, path: str) -> bool:
+    """Whether a leaf's bound is infinite: all of its numbers or none."""
+    infinite = np.isinf(bound)
+    if infinite.any() and not infinite.all():
+        check.refuse(f"{name}{path}", "be finite or infinite throughout", bound)
+    return bool(infinite.all())
 
 
 # the scenario as the unknown
@@ -355,7 +369,7 @@ def worst_case(
 class GradientCheck(NamedTuple):
     """A gradient beside central differences; every field has shape (n,), the numbers of theta in a row."""
 
-    gradient: Any  # as `tune` takes it
+    gradient: Any  # by forward or reverse mode
     central: Any  # central difference of fourth order
     doubt: Any  # the difference's own uncertainty: by how much it changes when its step is halved
     relative: Any  # [1] |gradient - central| over the larger of the two; 0 where both are 0
@@ -370,16 +384,23 @@ def gradient_check(cost: Callable, theta, key, *, step: float | None = None, for
 
     Raises TypeError if the cost is no scalar.
     """
-    theta = _floats(theta)
-    flat, unravel = ravel_pytree(theta)
-    slopes = compiled(lambda theta, key: value_and_gradient(cost, theta, key, forward=forward)[1], 0)
-    gradient = np.asarray(ravel_pytree(slopes(theta, key))[0])
-    value = compiled(lambda flat, key: cost(unravel(flat), key), 0)
+    flat, unravel = ravel_pytree(_floats(theta))
+    at = lambda flat, key: cost(unravel(flat), key)
+    if flat.size <= FEW if forward is None else forward:  # one compilation, the directions one by one
+        along = lambda flat, way, key: jax.jvp(lambda a: at(a, key), (flat,), (way,))
+        run = compiled(along, 0)
+        _scalar(at, flat, key)
+        gradient = np.array([run(flat, way, key)[1] for way in jnp.eye(flat.size, dtype=flat.dtype)])
+        value = lambda flat: float(run(flat, jnp.zeros_like(flat), key)[0])
+    else:
+        both = compiled(lambda flat, key: value_and_gradient(at, flat, key, forward=False), 0)
+        gradient = np.asarray(both(flat, key)[1])
+        value = lambda flat: float(both(flat, key)[0])
     h = np.finfo(flat.dtype).eps ** 0.2 if step is None else step
     central, doubt = np.zeros((2, flat.size))
     for i in range(flat.size):
         size = h * max(1.0, abs(float(flat[i])))
-        d = lambda by, i=i, size=size: float(value(flat.at[i].add(by * size), key))
+        d = lambda by, i=i, size=size: value(flat.at[i].add(by * size))
         inner, middle, outer = d(0.5) - d(-0.5), (d(1) - d(-1)) / 2, (d(2) - d(-2)) / 4
         central[i] = (4 * inner - middle) / 3 / size
         doubt[i] = abs(central[i] - (4 * middle - outer) / 3 / size)

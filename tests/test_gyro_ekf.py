@@ -307,22 +307,6 @@ def test_bias_is_borne_by_the_integral_without_a_filter():
     assert values.ok.tolist() == [True, False]
 
 
-def test_gain_gradient_of_the_loop_without_a_filter():
-    scenario = Scenario(**QUIET, bias=np.zeros(4))
-    noise = jnp.zeros((64, 11))
-
-    def cost(log_gain):
-        p = params._replace(k_p=jnp.exp(log_gain[0]) * Vec3(*map(jnp.asarray, params.k_p)),
-                            k_d=jnp.exp(log_gain[1]) * Vec3(*map(jnp.asarray, params.k_d)))  # fmt: skip
-        log = jaxatt.simulate(direct, p, scenario, noise, ticks=64)
-        return jnp.sum(log.angle @ log.angle) * 1e6
-
-    cost = jax.jit(cost)
-    gradient = np.asarray(jax.grad(cost)(jnp.zeros(2)))
-    central = [(cost(1e-4 * e) - cost(-1e-4 * e)) / 2e-4 for e in jnp.eye(2)]
-    np.testing.assert_allclose(gradient, central, rtol=1e-6)
-
-
 # protocol
 
 

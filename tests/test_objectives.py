@@ -54,6 +54,18 @@ def test_soft_detection_tends_to_the_real_one():
     np.testing.assert_allclose(delay, soft_delay(jnp.concatenate([p, p[:1]]), DT) - DT, rtol=1e-12)
 
 
+def test_soft_settling_tends_to_the_last_time_outside():
+    q = np.abs(np.exp(-0.3 * DT * np.arange(80))[:, None] * np.cos(DT * np.arange(80)[:, None] * np.linspace(1, 3, 6)))
+    window = DT * np.arange(80) < 6.95
+    told_by = lambda width: told(lambda now, x: ob.settling(now, ob.alarm(x, 0.2, width), now.t < 6.95), q)
+    last = np.array([DT * (1 + np.flatnonzero(window & (column > 0.2)).max()) for column in q.T])
+    np.testing.assert_allclose(told_by(1e-7), last, atol=1e-6)
+    assert np.abs(told_by(0.01) - last).max() < 0.7  # a lobe that just reaches the band counts in part
+    p = ob.alarm(q[:70], 0.2, 0.05)
+    silent_after = np.cumprod((1 - p)[::-1], axis=0)[::-1]
+    np.testing.assert_allclose(told_by(0.05), DT * np.sum(1 - silent_after, axis=0), rtol=1e-12)
+
+
 def test_chatter_is_the_rms_of_the_jumps_in_one_window():
     u = RNG.normal(size=(30, 4))
     got = told(lambda now, x: ob.chatter(x, now.t > 0.95), u)
@@ -98,7 +110,7 @@ def test_the_smooth_growth_rate_bounds_the_largest_one():
 
 
 def test_the_margins_of_the_papers_proof():
-    """Spec, 4 and 5.7: k_q = 330 needs eps > 0.00303032; T_I at the start is 31.7 for eps = 0.1, -0.0206 for 0.00304."""
+    """From an independent implementation: k_q = 330 needs eps > 0.00303032; T_I at the start is 31.7 for eps = 0.1, -0.0206 for 0.00304."""
     largest, q, w = 31.8566039, 0.76533, 1.30721
     m = op.margins(op.params, largest, q, w)
     assert abs(m.T - 31.7) < 0.05 and m.eps == pytest.approx(0.354348 - 0.1, abs=1e-6)

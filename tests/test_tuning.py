@@ -1,5 +1,6 @@
 """Tuning by gradient: the search itself, on costs with known minima."""
 
+import importlib
 import os
 import signal
 import subprocess
@@ -192,11 +193,15 @@ def test_bounds_are_a_change_of_variables():
             assert (moved[name] >= low[name]).all() and (moved[name] <= high[name]).all()
     middle = bounds.within(jax.tree.map(jnp.zeros_like, theta))
     assert middle["share"] == 1 and middle["ratio"] == pytest.approx(1) and middle["gain"][0] == 1
+    box = bounded(np.array([-1.0, 0.0]), np.array([1.0, 5.0]))
+    np.testing.assert_allclose(box.within(box.free(np.array([0.5, 4.0]))), [0.5, 4.0], rtol=1e-6)
     np.testing.assert_allclose(bounded(0.0, np.inf).free(jnp.array([1.0, np.e])), [0, 1], atol=1e-6)
     with pytest.raises(ValueError, match=r"`theta\['share'\]` must lie in \(-1\.0, 3\.0\), but it is 3\."):
         bounds.free({**theta, "share": 3.0})
     with pytest.raises(ValueError, match="`low` must be less than high, 1, but it is 2"):
         bounded(2, 1).free(0.5)
+    with pytest.raises(ValueError, match="`high` must be finite or infinite throughout"):
+        bounded(0.0, np.array([1.0, np.inf])).free(np.array([0.5, 0.5]))
 
 
 # scenarios as the unknown
@@ -286,7 +291,8 @@ def cmg_steering(theta, key):
         k_p=0.2 * jnp.exp(theta["k_p"]), k_i=0.02 * jnp.exp(theta["k_i"]),
         steering=Steering(lam0=0.01 * jnp.exp(theta["lam0"]), dither=0.1),
     )  # fmt: skip
-    log = simulate(cmg.system._replace(substeps=1), p, cmg.scenario, key, ticks=20)
+    turned = cmg.scenario._replace(gamma=cmg.scenario.gamma + theta["turn"] * jnp.array([1.0, -1.0, 1.0, 0.0]))
+    log = simulate(cmg.system._replace(substeps=1), p, turned, key, ticks=20)
     return jnp.mean(log.w @ log.w) + 1e-3 * jnp.mean(log.acceleration)
 
 
@@ -310,7 +316,7 @@ def wheel_adaptation(theta, key):
     [
         (observer_pd, "alpha beta sigma k_q k_w0 size"),
         (gyro_ekf_pid, "k_p k_i k_d R"),
-        (cmg_steering, "k_p k_i lam0"),
+        (cmg_steering, "k_p k_i lam0 turn"),
         (star_filters, "std_gyro std_star bandwidth damping"),
         (wheel_adaptation, "K gamma P0"),
     ],
@@ -319,3 +325,23 @@ def test_every_loops_gradient_equals_the_central_difference(cost, names):
     found = gradient_check(cost, {name: 0.03 for name in names.split()}, KEY)
     assert (np.abs(found.central) > 0).all()
     assert found.relative.max() < 1e-5, found
+
+
+# the command
+
+
+@pytest.mark.parametrize(("words", "wrong"), [(["nothing", "tune"], "nothing"), (["observer_pd", "polish"], "polish")])
+def test_the_command_refuses_what_it_does_not_know(words, wrong, monkeypatch, capsys):
+    from experiments import __main__ as command
+
+    monkeypatch.setattr(sys, "argv", ["experiments", *words])
+    with pytest.raises(SystemExit):
+        command.main()
+    assert f"but it is {wrong}" in capsys.readouterr().err
+
+
+def test_every_paper_has_a_study_of_its_gains():
+    from experiments.__main__ import NAMES, STUDIES
+
+    for name in NAMES:
+        assert callable(importlib.import_module(f"{STUDIES['tune']}.{name}").run)

@@ -1,26 +1,26 @@
-"""The smooth command limit of the gyro-loss loop, and what its tuning study stands on."""
+"""The tuning study of the gyro-loss loop: what its searches stand on."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from experiments.tuning import cmg_loss as study
-from jaxatt import simulate
+from jaxatt import Now, Vec3
 from jaxatt.systems import cmg_loss as cmg
 
 
-def test_the_smooth_limit_bounds_commands_and_keeps_a_slope():
-    u = np.array([-1e15, -2.0, -1e-3, 0.0, 0.5, 3.0])
-    limited = np.asarray(cmg.smoothly_limited(u, 0.7))
-    assert (np.abs(limited) <= 0.7).all() and limited[2] == pytest.approx(-1e-3, rel=1e-5)
-    np.testing.assert_array_equal(cmg.smoothly_limited(u, np.inf), u)
-    slope = jax.vmap(jax.grad(cmg.smoothly_limited), in_axes=(0, None))
-    assert (np.asarray(slope(u[1:], 0.7)) > 0).all() and np.isfinite(slope(u, np.inf)).all()
-
-
-def test_a_limit_that_is_none_is_refused():
-    with pytest.raises(ValueError, match=r"`params\.limit` must be greater than 0 \(inf for no limit\), but it is 0"):
-        simulate(cmg.system, cmg.params._replace(limit=0.0), cmg.scenario, jax.random.key(0), ticks=1)
+def test_the_rounded_limit_bounds_commands_and_leaves_small_ones_alone():
+    lost = study.stacked([cmg.lost(cmg.PYRAMID, (45, 45, 45, 45), onset=np.inf)] * 2)
+    params = jax.tree.map(lambda a: np.broadcast_to(a, (2,)), cmg.params)
+    z = jax.vmap(cmg.init, in_axes=-1, out_axes=-1)(params, lost)[1]
+    board = z.board._replace(u=np.array([[-1e15, -2.0, -1e-3, 0.5]] * 2).T)
+    x = jax.vmap(cmg.init, in_axes=-1, out_axes=-1)(params, lost)[0]
+    now = Now(1, 0.01, 0.01)  # between control samples: the command is held
+    case = study.Case(np.array([0.0, 1.0]), params, lost)
+    u = np.asarray(study.rounded_tick((), case, now, x, z._replace(board=board), np.zeros((3, 2)))[1].drive.u)
+    np.testing.assert_allclose(u[:, 0], [-1, -1, -1e-3, 0.5])
+    np.testing.assert_allclose(u[:, 1], np.tanh([-1e15, -2.0, -1e-3, 0.5]))
 
 
 def test_a_design_keeps_its_bounds():
@@ -33,16 +33,21 @@ def test_a_design_keeps_its_bounds():
     np.testing.assert_allclose(days.h.x[:3], days.h.x[3:])
 
 
-def test_gradients_of_gains_steering_and_rearrangement_are_those_of_the_values(monkeypatch):
-    monkeypatch.setattr(study, "SECONDS", 3)
-    h = study.momenta(study.TUNE, 2)
+def test_commands_have_the_slopes_of_their_values():
+    days = study.days(study.momenta(study.TUNE, 1), np.zeros((2, 3)))
+    axes, healthy = jax.tree.map(lambda a: a[:, 0], days.axes), np.array([1.0, 1, 1, 0])
+    board = cmg.Board(axes, Vec3(0.01, 0.0, -0.02), np.zeros(4))
 
-    def cost(theta):
+    def commands(theta):
         params, shift = study.design(theta)
-        return study.costs(params, study.days(h, shift)).mean()
+        gamma = days.gamma[:, 0] + jnp.append(shift[0], 0)
+        readings = cmg.Readings(Vec3(0.03, -0.02, 0.01), gamma, healthy)
+        board_, _ = cmg.decide(params, Now(0, 0.3, 0.01), board, readings)
+        return board_.u
 
     along = np.random.default_rng(2).normal(size=study.START.size)
-    line = jax.jit(lambda s: jax.jvp(lambda s: cost(study.START + s * along), (s,), (1.0,)))
-    step = 1e-5
-    slope, (up, down) = line(0.0)[1], (line(s)[0] for s in (step, -step))
-    assert float(slope) == pytest.approx(float(up - down) / (2 * step), rel=1e-5)
+    line = jax.jit(lambda s: jax.jvp(lambda s: commands(study.START + s * along), (s,), (1.0,)))
+    h = 1e-6
+    slope, difference = line(0.0)[1], (line(h)[0] - line(-h)[0]) / (2 * h)
+    np.testing.assert_allclose(slope, difference, rtol=1e-5)
+    assert (np.abs(slope[:3]) > 1e-3).all() and slope[3] == 0

@@ -69,6 +69,8 @@ def test_pid_keeps_the_integral_time_and_levels_go_where_they_belong():
 
 
 def test_every_seed_brings_other_days_and_all_subsets():
-    days = [study.drawn(seed, np.arange(16)) for seed in (study.TUNE, study.CHOOSE, study.VERDICT)]
+    days = [study.drawn(seed, range(16), 2) for seed in (study.TUNE, study.CHOOSE, study.VERDICT)]
     assert len({float(day.w.x[0]) for day in days}) == 3
-    assert (np.isfinite(days[0].gyro.onset).sum(0) == [len(s) for s in SUBSETS]).all()
+    onset = days[0].gyro.onset.reshape(4, 16, 2)
+    assert (np.isfinite(onset).sum(0) == np.array([[len(s)] for s in SUBSETS])).all()
+    np.testing.assert_array_equal(days[0].h[:, :2], days[0].h[:, 2:4])  # the same states for every subset

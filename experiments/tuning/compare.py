@@ -252,12 +252,16 @@ def _trace(points, cost) -> Trace:
     return Trace(np.arange(1, len(cost) + 1), _finite(cost), points)
 
 
-def contest(report, gradient: Trace, costs: Callable, start, low, high, budget: int, unit: str, dearer: float, seeds):
+def contest(
+    report, gradient: Trace, costs: Callable, start, low, high, budget: int, unit: str, dearer: float | None, seeds,
+    figure: str = "budget",
+):  # fmt: skip
     """All baselines on the cost of a gradient search: a line each, the figure `budget_figure`, and the races.
 
     Random search and CMA-ES run once for each seed; Nelder-Mead has no chance in it and, like CMA-ES, starts where
     the gradient did. dearer: CPU time of a value and gradient in values, `cpu_ratio`, beside the count of
-    `gradient_price`. Returns, for each baseline, its races at no slack and at a slack of 1 %, two lists over seeds.
+    `gradient_price`; None: not measured. figure: name of the figure. Returns, for each baseline, its races at no slack
+    and at a slack of 1 %, two lists over seeds.
     """
     traces = {
         "gradient": [gradient],
@@ -268,7 +272,7 @@ def contest(report, gradient: Trace, costs: Callable, start, low, high, budget: 
     price = gradient.spent[0]
     report.note(
         f"gradient: cost {gradient.cost[0]:.6g} -> {gradient.cost.min():.6g} in {len(gradient.cost)} steps, each "
-        f"counted as {price:g} simulations; in CPU time it is {dearer:.3g}"
+        f"counted as {price:g} simulations" + (f"; in CPU time it is {dearer:.3g}" if dearer else "")
     )
     races = {}
     for name, several in list(traces.items())[1:]:
@@ -277,13 +281,19 @@ def contest(report, gradient: Trace, costs: Callable, start, low, high, budget: 
         least = [r.target for r in exact]
         report.note(f"{name}: least cost {np.median(least):.6g} ({min(least):.6g} to {max(least):.6g})")
         for label, some in (("its final cost", exact), ("99 % of its gain", near)):
-            middle = lambda field, some=some: float(np.median([getattr(r, field) for r in some]))
+            its, ours, fewer, less = (
+                float(np.median([getattr(r, field) for r in some]))
+                for field in ("baseline", "gradient", "fewer", "fewer_than_budget")
+            )  # medians over seeds, so that fewer is not its / ours
+            line = f"  {label}: after {its:.0f} simulations; gradient "
+            if np.isinf(ours):
+                report.note(line + f"never in its {gradient.spent[-1]:.0f}")
+                continue
             report.note(
-                f"  {label}: after {middle('baseline'):.0f} simulations, gradient {middle('gradient'):.0f}: "
-                f"{middle('fewer'):.2g} times fewer ({middle('fewer_than_budget'):.2g} times fewer than the budget of "
-                f"{budget}; in CPU time {middle('fewer') * price / dearer:.2g} times less)"
+                f"{line}after {ours:.0f}: {fewer:.2g} times fewer, {less:.2g} times fewer than the budget of {budget}"
+                + (f"; in CPU time {fewer * price / dearer:.2g} times less" if dearer else "")
             )
-    report.figure("budget", budget_figure(traces, budget, unit, report.experiment))
+    report.figure(figure, budget_figure(traces, budget, unit, report.experiment))
     return races
 
 
@@ -315,8 +325,8 @@ STYLES = {  # colour-blind safe, and told apart in grey by the dashes
 def budget_figure(traces: dict[str, list[Trace]], budget: float, unit: str, title: str = ""):
     """Lowest cost so far against simulations spent, and how far it is above the lowest that any search found.
 
-    Median and range over the traces of each method. traces: for each method of `STYLES` its traces over seeds;
-    unit: of the cost, for the axis.
+    Median and range over the traces of each method. traces: for each method of `STYLES` its traces over seeds, that
+    of the gradient first; unit: of the cost, for the axis.
     """
     fig, (left, right) = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
     spent = np.unique(np.round(np.geomspace(1, budget, 400)))
@@ -333,8 +343,11 @@ def budget_figure(traces: dict[str, list[Trace]], budget: float, unit: str, titl
     for ax in (left, right):
         ax.set(xscale="log", xlim=(1, budget), xlabel="simulations (a gradient of p numbers: 1 + p)")
         ax.grid(alpha=0.3)
-    left.set(ylabel=f"lowest cost so far [{unit}]")
+    left.set(yscale="log" if least > 0 else "linear", ylabel=f"lowest cost so far [{unit}]")
     right.set(yscale="log", ylabel=f"the same, less the lowest of all [{unit}]")
+    gain = next(iter(traces.values()))[0].cost[0] - least
+    if np.isfinite(gain) and gain > 0:
+        right.set_ylim(1e-4 * gain, 2 * gain)  # no need to see a simplex polish its last digits
     left.legend(fontsize=8, title="median and range", title_fontsize=8)
     if title:
         fig.suptitle(title)

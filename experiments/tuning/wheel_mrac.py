@@ -144,7 +144,7 @@ def verdict(report, chosen, n: int) -> None:
     report.note(compare.told("runs with a false alarm of |y - y_m|", compare.paired_share(*falsely)))
     fig, ax = plt.subplots(figsize=(6, 4.5), layout="constrained")
     ax.loglog(before.peak[both], after.peak[both], ".", ms=3, color=BLUE, alpha=0.4)
-    ends = [0.5 * min(after.peak[both].min(), before.peak[both].min()), 2 * before.peak[both].max()]
+    ends = [before.peak[both].min(), before.peak[both].max()]
     ax.plot(ends, ends, color="k", lw=0.8, label="no change")
     ax.set(
         xlabel="peak true error before [deg]",

@@ -39,7 +39,6 @@ class Params(NamedTuple):
     J: Mat3 = Mat3(Vec3(50.0, 0.0, 0.0), Vec3(0.0, 50.0, 0.0), Vec3(0.0, 0.0, 30.0))  # [kg m^2] believed, J_S
     module: ModuleInertia = MODULE  # believed
     spin: Any = 600.0  # () [rad/s] believed wheel speed: h_w = I_ws spin
-    limit: Any = np.inf  # () [rad/s] smooth limit of the commands, limit tanh(u / limit); inf: the drives' alone
 
 
 class Failure(NamedTuple):
@@ -85,7 +84,7 @@ class Board(NamedTuple):
 
     axes: GimbalAxes  # (n,)
     integral: Vec3  # [rad] of the rate error
-    u: Any  # (n,) [rad/s] gimbal-rate command before the drives' limit
+    u: Any  # (n,) [rad/s] gimbal-rate command before the limit
 
 
 class Drive(NamedTuple):
@@ -182,17 +181,9 @@ def decide(params: Params, now, board: Board, y: Readings):
         J_T = cluster_inertia(params.J, cmg_triads(board.axes, y.gamma), params.module)
         torque = rate_pi(e, integral, J_T, params.k_p, params.k_i)
         a = -torque / (params.module.I_ws * params.spin)  # eq. (7): the gimbals give -h_w T rate
-        u = steer(params.steering, a, board.axes, y.gamma, y.healthy, now.t)
-        return board._replace(integral=integral, u=smoothly_limited(u, params.limit))
+        return board._replace(integral=integral, u=steer(params.steering, a, board.axes, y.gamma, y.healthy, now.t))
 
     return every(PERIOD, now, control, board), ()
-
-
-def smoothly_limited(u, limit):
-    """limit tanh(u / limit), u itself where the limit is inf. Its slope is nowhere zero, as a hard limit's is."""
-    there = jnp.isfinite(limit)
-    safe = jnp.where(there, limit, 1)
-    return jnp.where(there, safe * jnp.tanh(u / safe), u)
 
 
 def tick(params: Params, scenario: Scenario, now, x: X, z: Z, noise):
@@ -276,7 +267,6 @@ def refuse_bad(params: Params, scenario: Scenario) -> tuple:
     for name in Steering._fields:
         check.not_negative(f"params.steering.{name}", getattr(params.steering, name))
     check.positive("params.spin", params.spin)
-    check.above("params.limit", params.limit, 0, "inf for no limit")
     for name in ModuleInertia._fields:
         check.positive(f"params.module.{name}", getattr(params.module, name))
         check.positive(f"scenario.module.{name}", getattr(scenario.module, name))
