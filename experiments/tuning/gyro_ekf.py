@@ -121,7 +121,7 @@ def least_growth(several: list[Loops], starts: int, steps: int) -> np.ndarray:
         return [matrix(loops, BOX * jnp.tanh(a), BC) for loops, a in zip(several, free)]
 
     def cost(free, key):  # of loops that have nothing to do with each other: their searches go side by side
-        return 1e3 * jnp.sum(growth_rate(jnp.stack(matrices(free)), PERIOD, 1e6))
+        return 1e3 * jnp.sum(growth_rate(jnp.stack(matrices(free)), PERIOD, 2e5))
 
     _, history = multi_start(cost, free, optax.adam(0.03), steps, jax.random.key(TUNE))
     met = jnp.concatenate([history.theta[::10].reshape(-1, len(several), 9), history.theta[-1]])
@@ -200,7 +200,7 @@ def why_not_both(report, nominal: Loops) -> None:
     # within the box the x axis alone is least unstable at the least K_I
     factors = np.exp(np.linspace(-BOX, BOX, 20001))
     alone = growth_rates(x_axis(p * factors, q * np.exp(-BOX)), T)[:, 0].min()
-    starts, steps = (16, 150) if report.quick else (64, 500)
+    starts, steps = (16, 150) if report.quick else (128, 500)
     factors = (0.0, 1.0, 3.0, 10.0)
     least = least_growth([loops(f) for f in factors], starts, steps)
     report.relative("B and C dead: least growth in the box, no products of inertia", alone, least[0], 0.02,
