@@ -6,10 +6,9 @@ import jax
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.patches import Circle
-from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from experiments.report import Report, interval
-from jaxatt import simulate, sweep
+from jaxatt import plot, simulate, sweep
 from jaxatt import singularity as sg
 from jaxatt.controllers import Steering
 from jaxatt.mounting import cmg_triads, modules
@@ -150,12 +149,10 @@ def surfaces(report: Report) -> None:
         for i, (group, n, example) in enumerate(panels):
             ax = fig.add_subplot(2, 3, i + 1, projection="3d")
             minus = example.count(-1)
-            draw_surface(ax, group[name], minus)
+            plot.singular_surface(group[name], minus, ax)
             kind = "external" if minus == 0 else f"internal, {minus} of {n} reversed"
             size = 4 if name == "box-90" else 3
             ax.set(xlim=(-size, size), ylim=(-size, size), zlim=(-size, size), title=f"{n} modules, {kind}")
-            ax.set(xlabel="$h_x / h_w$", ylabel="$h_y / h_w$", zlabel="$h_z / h_w$")
-            ax.set_box_aspect((1, 1, 1))
         fig.suptitle(f"Singular momenta, {name}; circles and discs: gimbal axis along the singular direction")
         fig.tight_layout(w_pad=3, h_pad=4)
         report.figure(f"figures_3_4_13_16_{name}", fig)
@@ -173,36 +170,6 @@ def surfaces(report: Report) -> None:
         ax.set_title(f"{name}: condition $\\geq$ 100, {shown.shape[1]} of 120$^3$")
     fig.tight_layout(w_pad=4)
     report.figure("figure_5_singular_angles", fig)
-
-
-def draw_surface(ax, axes, minus: int) -> None:
-    """The surfaces of all sign patterns with so many modules reversed, and the rims of their holes."""
-    polar, around = np.meshgrid(np.linspace(0, np.pi, 81), np.linspace(0, 2 * np.pi, 161), indexing="ij")
-    u = Vec3(np.sin(polar) * np.cos(around), np.sin(polar) * np.sin(around), np.cos(polar))
-    n = axes.r.x.shape[0]
-    patterns = [e for e in sg.sign_patterns(n) if min((e < 0).sum(), n - (e < 0).sum()) == minus]
-    for signs in patterns:
-        h, _ = sg.singular_momentum(axes, Vec3(*(a.ravel() for a in u)), signs)
-        p = np.asarray(array(h)).T.reshape(81, 161, 3)
-        quads = np.stack([p[:-1, :-1], p[1:, :-1], p[1:, 1:], p[:-1, 1:]], axis=2).reshape(-1, 4, 3)
-        whole = np.linalg.norm(quads - np.roll(quads, 1, axis=1), axis=-1).max(1) < 1.1  # no bridge over a hole
-        quads = quads[whole & np.isfinite(quads).all((1, 2))]
-        height = quads[:, :, 2].mean(1)
-        colours = plt.get_cmap("viridis")(0.5 + height / 7)
-        ax.add_collection3d(Poly3DCollection(quads, facecolors=colours, alpha=0.35 if minus else 0.8, linewidths=0))
-    turn = np.linspace(0, 2 * np.pi, 80)
-    for rim in sg.rims(axes):
-        if (rim.modules == 1) or minus:
-            e = np.cross(rim.normal, [0.3, 0.5, 0.8])
-            e /= np.linalg.norm(e)
-            circle = rim.centre + rim.modules * (
-                np.cos(turn)[:, None] * e + np.sin(turn)[:, None] * np.cross(rim.normal, e)
-            )
-            for sign in (1, -1):
-                if rim.modules > 1:
-                    disc = Poly3DCollection([sign * circle], facecolor=COLOURS[1], alpha=0.12)
-                    ax.add_collection3d(disc)
-                ax.plot(*(sign * circle).T, color=COLOURS[1], linewidth=0.6)
 
 
 # section 3.4

@@ -19,8 +19,9 @@ from jaxatt.attitude import mrp_matrix, mrp_rate, mrp_rate_transposed
 from jaxatt.bodies import body_acceleration
 from jaxatt.engine import rk4
 from jaxatt.estimators import AttitudeRate, mrp_observer
-from jaxatt.study import batch, value_and_gradient
+from jaxatt.study import batch
 from jaxatt.systems import observer_pd as op
+from jaxatt.tuning import value_and_gradient
 from jaxatt.vec import array, cross, inverse, norm, vec3
 
 HEALTHY = on_axes(Fault())

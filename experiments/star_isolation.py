@@ -17,8 +17,9 @@ import numpy as np
 import optax
 
 from experiments.report import Report, interval, plt
-from jaxatt import Fault, Quat, Vec3, detection, scores, simulate, sweep, tune
+from jaxatt import Fault, Quat, Vec3, detection, plot, scores, simulate, sweep, tune
 from jaxatt.lmmse import lmmse_predict, lmmse_start, lmmse_update
+from jaxatt.replay import replay
 from jaxatt.study import batch
 from jaxatt.systems.star_isolation import (
     ARCSEC,
@@ -31,11 +32,12 @@ from jaxatt.systems.star_isolation import (
     TURN,
     WITH_BIAS,
     Scenario,
+    decide,
+    init,
     on_sensor,
     orbit_rate,
     params,
     quaternion_error,
-    replay,
     scenario,
     score,
     seen,
@@ -314,7 +316,8 @@ def detection_table(report: Report) -> None:
 
     fig, (ax, ax_delay) = plt.subplots(1, 2, figsize=(11, 4.4))
     reference = {1: 0.28, 5: 0.80, 10: 0.955, 50: 1.0}
-    colours = dict(zip(reference, (BLUE, ORANGE, GREEN, "#CC79A7")))
+    curves: dict[str, detection.Roc] = {}
+    colours = dict(zip(reference, plot.COLOURS))
     for length, expected in reference.items():
         J0 = np.asarray(detection.windowed(evaluations[0], length))[500:]
         J2 = np.asarray(detection.windowed(evaluations[2], length))[window].max(axis=0)
@@ -325,15 +328,14 @@ def detection_table(report: Report) -> None:
         )  # 0.05: the threshold rests on few samples
         report.check(f"ROC at false alarms 1e-4 per sample, 2 std, N = {length}", expected, found, allowed, "reference")
         curve = detection.roc(J0, J2, np.quantile(J0, 1 - np.geomspace(1e-5, 1, 200)))
-        ax.semilogx(np.maximum(curve.false_alarm, 1e-6), curve.detection, color=colours[length], label=f"N = {length}")
+        curves[f"N = {length}"] = curve
         threshold = np.quantile(J0, 1 - 1e-4)
         alarms = np.asarray(detection.windowed(evaluations[2], length)) > threshold
         delays = detection.first_alarm(alarms, DT * np.arange(len(alarms)), 100.0)
         times = np.linspace(0, 9.9, 100)
         ax_delay.plot(times, detection.detected_by(delays, times), color=colours[length], label=f"N = {length}")
-    chance_at = np.geomspace(1e-5, 1, 50)
-    ax.plot(chance_at, detection.chance(chance_at, 100), color=GREY, ls=":", label="chance, 100 independent samples")
-    ax.set(xlabel="false alarms per sample [1]", ylabel="P(alarm within 10 s) [1]", xlim=(1e-5, 1), ylim=(0, 1.02))
+    plot.roc(curves, samples=100, least=1e-5, ax=ax)
+    ax.set(ylabel="P(alarm within 10 s) [1]")
     ax.set_title("constant fault of 2 std, roll star")
     ax.legend(loc="lower right", fontsize=8)
     ax_delay.set(xlabel="time after the fault [s]", ylabel="share detected [1]", ylim=(0, 1.02), xlim=(0, 10))
@@ -655,7 +657,9 @@ def _map(s: np.ndarray) -> np.ndarray:
 def likelihood(theta, readings):
     """Mean negative log likelihood of the innovations of both filters, theta = log (sg, ss) believed / true."""
     p = params._replace(std_gyro=params.std_gyro * jnp.exp(theta["gyro"]), std_star=STD * jnp.exp(theta["star"]))
-    of = replay(LMMSE, p, batch(healthy, readings.gyro.x.shape[1]).q_hat, readings)
+    n = readings.gyro.x.shape[1]
+    start = jax.tree.map(lambda a: jnp.broadcast_to(a[..., None], (*a.shape, n)), init(LMMSE, 1, p, healthy)[1].board)
+    of = jax.tree.map(lambda a: a[1:], replay(decide, p, start, readings, dt=DT)[1].innovation)
     return 0.5 * jnp.mean(of.log_det + of.nis)
 
 

@@ -10,21 +10,25 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 
+from jaxatt.check import door
 from jaxatt.vec import Mat3, Quat, Vec3, cross, norm, safe_sqrt
 
 # MRP
 
 
+@door
 def mrp_rate(q: Vec3, w: Vec3) -> Vec3:
     """dq/dt = G(q) w [1/s] of MRP q for the body rate w [rad/s]; G = ((1 - q.q) I + 2 S(q) + 2 q q') / 4."""
     return (0.25 - 0.25 * (q @ q)) * w + 0.5 * (cross(q, w) + (q @ w) * q)
 
 
+@door
 def mrp_rate_transposed(q: Vec3, v: Vec3) -> Vec3:
     """G(q)' v, the transpose of the map of `mrp_rate`."""
     return (0.25 - 0.25 * (q @ q)) * v + 0.5 * ((q @ v) * q - cross(q, v))
 
 
+@door
 def mrp_product(p: Vec3, q: Vec3) -> Vec3:
     """MRP of the matrix product A(p) A(q), the representative with |.| <= 1; no singularity.
 
@@ -37,16 +41,19 @@ def mrp_product(p: Vec3, q: Vec3) -> Vec3:
     return 1 / jnp.where(c <= 2 * d, d, d - c) * numerator
 
 
+@door
 def mrp_error(q: Vec3, q_d: Vec3) -> Vec3:
     """MRP of A(q_d)' A(q), the attitude q as seen from the target q_d, |.| <= 1; de/dt = G(e) w for a target at rest."""
     return mrp_product(-q_d, q)
 
 
+@door
 def mrp_inner(q: Vec3) -> Vec3:
     """The representative with |q| <= 1: the shadow -q/|q|^2 where |q| > 1."""
     return -1 / jnp.where(q @ q > 1, q @ q, -1) * q
 
 
+@door
 def mrp_nearest(q: Vec3, p: Vec3) -> Vec3:
     """The representative of q, itself or its shadow, that lies nearest to p."""
     qq = q @ q
@@ -54,16 +61,19 @@ def mrp_nearest(q: Vec3, p: Vec3) -> Vec3:
     return 1 / jnp.where(keep, 1, -qq) * q
 
 
+@door
 def mrp_matrix(q: Vec3) -> Mat3:
     """Rotation matrix of MRP q, body to reference."""
     return quat_matrix(quat_from_mrp(q))
 
 
+@door
 def mrp_from_quat(p: Quat) -> Vec3:
     """MRP, |q| <= 1, of a unit quaternion."""
     return jnp.where(p.w < 0, -1, 1) / (1 + jnp.abs(p.w)) * p.v
 
 
+@door
 def quat_from_mrp(q: Vec3) -> Quat:
     """Unit quaternion of MRP q."""
     qq = q @ q
@@ -73,32 +83,38 @@ def quat_from_mrp(q: Vec3) -> Quat:
 # quaternions
 
 
+@door
 def quat_conjugate(p: Quat) -> Quat:
     """The inverse of a unit quaternion."""
     return Quat(p.w, -p.x, -p.y, -p.z)
 
 
+@door
 def quat_normalised(p: Quat) -> Quat:
     """p / |p|."""
     return p * (1 / jnp.sqrt(p @ p))
 
 
+@door
 def quat_error(p: Quat, p_d: Quat) -> Quat:
     """Attitude p as seen from the target p_d."""
     return quat_conjugate(p_d) * p
 
 
+@door
 def quat_rate(p: Quat, w: Vec3) -> Quat:
     """dp/dt = p (0, w) / 2 [1/s] for the body rate w [rad/s]."""
     return 0.5 * (p * Quat(jnp.zeros_like(w.x), *w))
 
 
+@door
 def quat_rotate(p: Quat, v: Vec3) -> Vec3:
     """v from body to reference components: p v conj(p)."""
     t = 2 * cross(p.v, v)
     return v + p.w * t + cross(p.v, t)
 
 
+@door
 def quat_matrix(p: Quat) -> Mat3:
     """Rotation matrix of a unit quaternion, body to reference."""
     w, x, y, z = p
@@ -109,6 +125,7 @@ def quat_matrix(p: Quat) -> Mat3:
     )
 
 
+@door
 def quat_from_vector(r: Vec3) -> Quat:
     """Unit quaternion of the rotation vector r [rad]; smooth at zero."""
     half = 0.5 * norm(r)
@@ -117,6 +134,7 @@ def quat_from_vector(r: Vec3) -> Quat:
     return Quat(jnp.cos(half), *(0.5 * sinc * r))
 
 
+@door
 def quat_angle(p: Quat):
     """Rotation angle of a unit quaternion [rad], in [0, pi]."""
     return 2 * jnp.arctan2(norm(p.v), jnp.abs(p.w))
@@ -125,6 +143,7 @@ def quat_angle(p: Quat):
 # Euler angles 3-2-1: about z, then the new y, then the new x. As Vec3 (about x, about y, about z) [rad].
 
 
+@door
 def euler_rate(a: Vec3, w: Vec3) -> Vec3:
     """d(angles)/dt [rad/s] for the body rate w [rad/s]; singular where the angle about y is +-90 deg."""
     s, c = jnp.sin(a.x), jnp.cos(a.x)
@@ -132,6 +151,7 @@ def euler_rate(a: Vec3, w: Vec3) -> Vec3:
     return Vec3(w.x + jnp.tan(a.y) * q, w.y * c - w.z * s, q / jnp.cos(a.y))
 
 
+@door
 def euler_body_rate(a: Vec3, rate: Vec3) -> Vec3:
     """Body rate [rad/s] of the angle rates: the inverse of `euler_rate`, regular everywhere."""
     s, c = jnp.sin(a.x), jnp.cos(a.x)
@@ -139,6 +159,7 @@ def euler_body_rate(a: Vec3, rate: Vec3) -> Vec3:
     return Vec3(rate.x - rate.z * jnp.sin(a.y), rate.y * c + q * s, q * c - rate.y * s)
 
 
+@door
 def quat_from_euler(a: Vec3) -> Quat:
     """Unit quaternion of 3-2-1 Euler angles [rad]."""
     o = jnp.zeros_like(a.x)
@@ -149,6 +170,7 @@ def quat_from_euler(a: Vec3) -> Quat:
     return about_z * about_y * about_x
 
 
+@door
 def euler_from_quat(p: Quat) -> Vec3:
     """3-2-1 Euler angles [rad] of a unit quaternion, the angle about y in [-90, 90] deg."""
     m = quat_matrix(p)

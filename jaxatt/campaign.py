@@ -32,7 +32,7 @@ import numpy as np
 from jaxatt import check
 from jaxatt.engine import BLOCK, System, block_records, block_scores, compiled, raw_key
 from jaxatt.study import _bar, _lanes_of, logged, scored
-from jaxatt.summary import Rate, rate_of
+from jaxatt.summary import Rate, narrowed
 
 try:
     import xarray as xr
@@ -655,9 +655,9 @@ def until(path, campaign: Campaign, looks, success: Callable, half_width: float,
 
     looks: growing numbers of scenarios at which the interval is looked at, fixed beforehand; multiples of the
     block are cheapest. success(dataset) -> bools, one for each scenario; their share is the rate. half_width: of its
-    interval, at which to stop. The error 1 - level is shared out equally among the looks (Bonferroni) and each interval is Clopper and Pearson's, so
-    the interval returned covers the rate with probability of at least level, whenever it stopped. That holds for
-    iid scenarios. how: the keywords of `run`, but for shards, which cannot see each other's scenarios.
+    interval, at which to stop. However it stopped, the interval covers the rate with probability of at least
+    ``level`` (`jaxatt.summary.narrowed`), if the scenarios are iid. how: the keywords of `run`, but for shards,
+    which cannot see each other's scenarios.
 
     Returns the dataset up to the look at which it stopped, and the `Rate` there.
     """
@@ -666,10 +666,12 @@ def until(path, campaign: Campaign, looks, success: Callable, half_width: float,
         check.refuse("looks", "be growing numbers of scenarios", looks)
     check.between("half_width", half_width, 0, 1, "a share")
     path = Path(path)
-    for n in looks:
-        stored = _opened(path).manifest["n"] if path.exists() else n
-        some = (extend if n > stored else run)(path, campaign, max(n, stored), **how).isel(scenario=slice(n))
-        rate = rate_of(int(np.sum(success(some))), n, 1 - (1 - level) / len(looks))
-        if (rate.high - rate.low) / 2 <= half_width:
-            break
-    return some, rate
+
+    def counts():
+        for n in looks:
+            stored = _opened(path).manifest["n"] if path.exists() else n
+            done = (extend if n > stored else run)(path, campaign, max(n, stored), **how)
+            yield int(np.sum(success(done.isel(scenario=slice(n)))))
+
+    rate = narrowed(counts(), looks, half_width, level)
+    return dataset(path).isel(scenario=slice(rate.trials)), rate

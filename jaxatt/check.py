@@ -8,7 +8,10 @@ message. Imports nothing of jaxatt.
 
 from __future__ import annotations
 
-from typing import Any, NoReturn
+from collections.abc import Callable
+from functools import wraps
+from inspect import signature
+from typing import Any, NoReturn, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +25,14 @@ def refuse(name: str, must: str, value, lane: int | None = None) -> NoReturn:
     raise ValueError(f"`{name}` must {must}, but it is {value}{where}.")
 
 
+def short(value) -> str:
+    """A value in one short line."""
+    if hasattr(value, "dtype") and hasattr(value, "shape") and value.shape:
+        return f"an array of shape {value.shape} and type {value.dtype}"
+    words = " ".join(repr(value).split())
+    return words if len(words) <= 80 else f"{words[:77]}..."
+
+
 def concrete(tree) -> bool:
     """Whether a tree holds numbers and no tracers."""
     return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
@@ -32,7 +43,7 @@ def each(name: str, must: str, value, good) -> None:
     value, good = np.broadcast_arrays(np.asarray(value), np.asarray(good))
     if not good.all():
         bad = tuple(int(i) for i in np.argwhere(~good)[0])
-        refuse(name, must, f"{value[bad]:g}", bad[-1] if bad else None)
+        refuse(name, must, f"{float(value[bad]):g}", bad[-1] if bad else None)
 
 
 def positive(name: str, value) -> None:
@@ -112,10 +123,38 @@ def moments(name: str, matrix) -> np.ndarray | None:
 
 
 def whole(name: str, value, least: int = 1) -> int:
-    """Refuse what is not a whole number >= least; return it as int."""
+    """Refuse what is not a whole number >= least, or more than 32 bits can count; return it as int."""
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
-        refuse(name, f"be a whole number of at least {least}", repr(value))
+        refuse(name, f"be a whole number of at least {least}", short(value))
+    if value >= 2**31:
+        refuse(name, "be less than 2147483648", short(value))
     return int(value)
+
+
+def function(name: str, value) -> None:
+    """Refuse, with TypeError, what cannot be called."""
+    if not callable(value):
+        raise TypeError(f"`{name}` must be a function, but it is {short(value)}.")
+
+
+def fits_memory(name: str, takes: int, way_out: str) -> None:
+    """Refuse a result of so many bytes if they are not free; name: of what it holds, way_out: what to do instead."""
+    free = free_memory()
+    if takes > free:
+        raise ValueError(f"{name} takes {takes / 1e9:.3g} GB, but {free / 1e9:.3g} GB of memory are free: {way_out}.")
+
+
+def free_memory() -> float:
+    """Bytes of memory that are free on the device of a run; inf where nobody can tell."""
+    if jax.default_backend() != "cpu":
+        stats = jax.local_devices()[0].memory_stats() or {}
+        return stats.get("bytes_limit", np.inf) - stats.get("bytes_in_use", 0)
+    try:
+        with open("/proc/meminfo") as file:
+            lines = dict(line.split(":") for line in file)
+        return 1024.0 * int(lines["MemAvailable"].split()[0])
+    except (OSError, KeyError, ValueError):
+        return np.inf
 
 
 def float_type(trees):
@@ -128,7 +167,7 @@ def converted(params, scenario) -> tuple[Any, Any]:
     """params and scenario with every leaf an array of strong type and all floats of one type.
 
     Python numbers become floats; integer and bool arrays stay what they are. Raises TypeError for a leaf that
-    is no number.
+    is no number, or one of another size than 32 or 64 bits.
     """
     dtype = float_type((_numbers("params", params), _numbers("scenario", scenario)))
 
@@ -143,11 +182,70 @@ def converted(params, scenario) -> tuple[Any, Any]:
 
 def _numbers(name: str, tree):
     for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
-        if not isinstance(leaf, (bool, int, float, np.ndarray, np.generic, jax.Array)) or (
-            isinstance(leaf, (np.ndarray, np.generic)) and leaf.dtype.kind not in "biuf"
-        ):
-            raise TypeError(f"`{name}{jax.tree_util.keystr(path)}` must be a number or an array, but it is {leaf!r}.")
+        if not is_number(leaf):
+            raise TypeError(
+                f"`{name}{jax.tree_util.keystr(path)}` must be a number or an array, but it is {short(leaf)}."
+            )
+        if hasattr(leaf, "dtype") and leaf.dtype.kind not in "biu" and leaf.dtype not in (np.float32, np.float64):
+            raise TypeError(f"`{name}{jax.tree_util.keystr(path)}` must be float32 or float64, but it is {leaf.dtype}.")
     return tree
+
+
+def is_number(leaf) -> bool:
+    """Whether a leaf is a real number or an array of them that a float can hold."""
+    if isinstance(leaf, (np.ndarray, np.generic)):
+        return leaf.dtype.kind in "biuf"
+    if isinstance(leaf, jax.Array):
+        return any(jnp.issubdtype(leaf.dtype, kind) for kind in (jnp.bool_, jnp.integer, jnp.floating))
+    return isinstance(leaf, (bool, float)) or (isinstance(leaf, int) and abs(leaf) < 2**63)
+
+
+def kind(name: str, value, wanted: type) -> None:
+    """Refuse, with TypeError, what is not of the wanted type."""
+    if type(value) is not wanted:
+        raise TypeError(f"`{name}` must be a {wanted.__name__}, but it is {short(value)}.")
+
+
+def shapes(params, scenario, params_like, scenario_like) -> tuple:
+    """The lanes of a scenario: `lanes_of` both, where params carry none or, in a design study, the scenario's."""
+    lanes, its = lanes_of("scenario", scenario, scenario_like), lanes_of("params", params, params_like)
+    if its not in ((), lanes):
+        refuse("params", f"carry no lanes, or the scenario's, {lanes}", its)
+    return lanes
+
+
+def lanes_of(name: str, tree, example) -> tuple:
+    """The lanes that the leaves of a tree carry behind the shapes of the example's: the same for all of them.
+
+    Refuses another structure and integers in place of floats, with TypeError, and other shapes, with ValueError, by
+    the name of the leaf. A part for which the example has None is passed over.
+    """
+    found = _lanes_found(name, tree, example)
+    (first, lanes), *others = found
+    for other, its in others:
+        if its != lanes:
+            refuse(other, f"carry the same lanes as `{first}`, {lanes}", its)
+    return lanes
+
+
+def _lanes_found(name: str, tree, example) -> list[tuple[str, tuple]]:
+    if example is None:
+        return []
+    if hasattr(example, "_fields"):
+        kind(name, tree, type(example))
+        return [
+            found
+            for field, part, its_example in zip(example._fields, tree, example)
+            for found in _lanes_found(f"{name}.{field}", part, its_example)
+        ]
+    if not is_number(tree):
+        raise TypeError(f"`{name}` must be a number or an array, but it is {short(tree)}.")
+    if hasattr(tree, "dtype") and not jnp.issubdtype(tree.dtype, jnp.floating):
+        raise TypeError(f"`{name}` must be floating-point, but it is {short(tree)}.")
+    shape, components = np.shape(tree), np.shape(example)
+    if shape[: len(components)] != components:
+        refuse(name, f"have shape ({''.join(f'{n}, ' for n in components)}*lanes)", shape)
+    return [(name, shape[len(components) :])]
 
 
 def lanes(scenarios) -> int:
@@ -166,3 +264,62 @@ def lanes(scenarios) -> int:
     if n == 0:
         raise ValueError("`scenarios` must hold at least one scenario, but its last axis is empty.")
     return n
+
+
+# the door of a function of numbers
+
+
+F = TypeVar("F", bound=Callable)
+
+
+def door(f: F) -> F:
+    """f, but what it cannot work with is refused in one line that names the argument.
+
+    Nothing is checked where f works, so that it costs nothing. For functions of numbers alone: what goes wrong in a
+    function that a caller hands in must be seen whole. An argument annotated with a NamedTuple must be one.
+    """
+    wanted = {name: str(p.annotation) for name, p in signature(f).parameters.items()}
+
+    @wraps(f)
+    def at_the_door(*args, **kwargs):
+        try:
+            return f(*args, **kwargs)
+        except (TypeError, ValueError, AttributeError, IndexError, ArithmeticError, NotImplementedError) as error:
+            if isinstance(error, (jax.errors.JAXTypeError, jax.errors.JAXIndexError)):
+                raise  # a tracer where a number is needed: no fault of the input
+            said = " ".join(str(error).split())
+            try:
+                given = signature(f).bind(*args, **kwargs).arguments
+            except TypeError as wrong:
+                raise TypeError(f"`{f.__name__}` must be called as {f.__name__}{signature(f)}: {wrong}.") from None
+            if isinstance(error, (TypeError, ValueError)) and said.startswith("`") and _subject(said) in given:
+                raise type(error)(said) from None
+            _blame(f.__name__, given, wanted, said)
+
+    return at_the_door  # pyright: ignore[reportReturnType]
+
+
+def _subject(said: str) -> str:
+    """The argument that a refusal names: what its first word begins with."""
+    word = said[1:].split("`")[0]
+    return "".join(c if c.isidentifier() or c.isdigit() else " " for c in word).split(" ")[0]
+
+
+def _blame(function: str, given: dict, wanted: dict, said: str) -> NoReturn:
+    for name, value in given.items():
+        note = wanted[name]
+        a_tuple = note.isidentifier() and note[0].isupper() and note not in ("Any", "Callable")
+        if a_tuple and type(value).__name__ != note:
+            raise TypeError(f"`{name}` must be a {note}, but it is {short(value)}.") from None
+        if note.startswith("Callable"):
+            continue
+        for leaf in jax.tree.leaves(value, is_leaf=lambda a: a is None):
+            if not is_number(leaf) and not (leaf is None and "None" in note):
+                raise TypeError(f"`{name}` must hold real numbers, but it holds {short(leaf)}.") from None
+    shapes = ", ".join(f"`{name}` has {_shapes(value)}" for name, value in given.items())
+    raise ValueError(f"`{function}` must get arguments that fit, but {shapes}: {said[:120]}") from None
+
+
+def _shapes(value) -> str:
+    shapes = sorted({str(np.shape(leaf)) for leaf in jax.tree.leaves(value)})
+    return f"shape {' and '.join(shapes[:3])}" if shapes else short(value)

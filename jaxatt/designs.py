@@ -74,9 +74,8 @@ def _permuted(n, key, index):
         return x ^ (x >> 16)
 
     def once(x):
-        left, right = x >> half, x & mask
-        for salt in rounds:
-            left, right = right, left ^ (mixed(right, salt) & mask)
+        step = lambda salt, pair: (pair[1], pair[0] ^ (mixed(pair[1], salt) & mask))
+        left, right = jax.lax.fori_loop(0, 6, lambda i, pair: step(rounds[i], pair), (x >> half, x & mask))
         return (left << half) | right
 
     start = once(jnp.asarray(index).astype(jnp.uint32))

@@ -15,6 +15,7 @@ import numpy as np
 from jax.scipy.special import gammaincc
 
 from jaxatt import check
+from jaxatt.check import door
 
 NONE, FIRST, SECOND, COMMON = 0, 1, 2, 3  # causes that two residual generators can tell apart
 CAUSES = ("none", "first sensor", "second sensor", "common to both")
@@ -22,6 +23,7 @@ CAUSES = ("none", "first sensor", "second sensor", "common to both")
 # windows and thresholds
 
 
+@door
 def windowed(evaluation, n: int):
     """Sum of the evaluation's last n values at every time, Yuan et al., eq. (18); fewer where fewer were seen.
 
@@ -34,21 +36,25 @@ def windowed(evaluation, n: int):
     return jax.lax.reduce_window(a, 0.0, jax.lax.add, (n, *ones), (1,) * a.ndim, pad)
 
 
+@door
 def threshold_nsigma(n, dof):
     """n^2 dof: every component of the residual n standard deviations off at once. dof = 3 N for N values of J."""
     return n * n * dof
 
 
+@door
 def threshold_moment(n, dof):
     """dof + n sqrt(2 dof): the mean of a chi-square number and n of its standard deviations."""
     return dof + n * jnp.sqrt(2.0 * dof)
 
 
+@door
 def threshold_mean(n, dof):
     """n dof: n times the mean of a chi-square number."""
     return n * dof
 
 
+@door
 def threshold_quantile(false_alarm, dof):
     """The value that a chi-square number of dof degrees of freedom exceeds with probability false_alarm.
 
@@ -72,11 +78,13 @@ def threshold_quantile(false_alarm, dof):
 # alarms and causes
 
 
+@door
 def alarm(evaluation, threshold):
     """Whether the evaluation exceeds its threshold; NaN alarms."""
     return ~(evaluation <= threshold)
 
 
+@door
 def isolate(first, second):
     """The cause that the alarms of two residual generators point to, eq. (20): one of `NONE` ... `COMMON`.
 
@@ -86,6 +94,7 @@ def isolate(first, second):
     return jnp.where(first & second, COMMON, jnp.where(first, FIRST, jnp.where(second, SECOND, NONE)))
 
 
+@door
 def isolate_first(first, second, patience):
     """The cause when the verdict waits patience [s] for the other alarm.
 
@@ -106,6 +115,7 @@ class Roc(NamedTuple):
     detection: Any  # [1] share of faulty values above it
 
 
+@door
 def roc(healthy, faulty, thresholds=None) -> Roc:
     """The ROC curve of values of an evaluation without fault, healthy, and with it, faulty, each flattened.
 
@@ -120,6 +130,7 @@ def roc(healthy, faulty, thresholds=None) -> Roc:
     return Roc(at, above(healthy), above(faulty))
 
 
+@door
 def detection_at(healthy, faulty, false_alarm) -> float:
     """The detection rate (faulty) at the lowest threshold whose false-alarm rate (healthy) is at most false_alarm."""
     healthy = np.sort(np.ravel(healthy))
@@ -128,6 +139,7 @@ def detection_at(healthy, faulty, false_alarm) -> float:
     return float(np.mean(np.ravel(faulty) > threshold))
 
 
+@door
 def area(curve: Roc) -> float:
     """Area under a ROC curve: the probability that a faulty value exceeds a healthy one."""
     x = np.concatenate([[0], curve.false_alarm, [1]])
@@ -135,6 +147,7 @@ def area(curve: Roc) -> float:
     return float(np.sum(np.diff(x) * (y[1:] + y[:-1]) / 2))
 
 
+@door
 def first_alarm(alarms, t, since=0.0):
     """Time [s] from since to the first alarm not before it, inf if never, (*lanes).
 
@@ -144,12 +157,14 @@ def first_alarm(alarms, t, since=0.0):
     return jnp.min(jnp.where(alarms & (t >= since), t - since, jnp.inf), axis=0)
 
 
+@door
 def detected_by(delays, times):
     """Share of runs detected within each of the times [s]: the distribution of delays [s], (runs,), inf for never."""
     delays = np.sort(np.ravel(delays))
     return np.searchsorted(delays, np.asarray(times), side="right") / len(delays)
 
 
+@door
 def chance(false_alarm, samples):
     """Probability of an alarm in so many independent healthy samples, false_alarm being that of one.
 
@@ -158,6 +173,16 @@ def chance(false_alarm, samples):
     return -jnp.expm1(samples * jnp.log1p(-jnp.asarray(false_alarm, float)))
 
 
+@door
+def interval(successes: int, trials: int, z: float = 1.959964) -> tuple[float, float]:
+    """Wilson's confidence interval of a share, 95 % by default; z: standard deviations on either side."""
+    p, n = successes / trials, trials
+    centre = (p + z * z / (2 * n)) / (1 + z * z / n)
+    half = z / (1 + z * z / n) * float(np.sqrt(p * (1 - p) / n + z * z / (4 * n * n)))
+    return max(0.0, centre - half), min(1.0, centre + half)
+
+
+@door
 def confusion(truth, verdict, causes: int = len(CAUSES)):
     """Counts of runs, shape (causes, causes): row what was wrong, ``truth``, column what was blamed, ``verdict``."""
     table = np.zeros((causes, causes), int)
@@ -168,6 +193,7 @@ def confusion(truth, verdict, causes: int = len(CAUSES)):
 # smooth surrogates, for gradients in thresholds, windows and gains
 
 
+@door
 def soft_windowed(evaluation, n, longest: int):
     """`windowed` evaluation, (T, *lanes), by a window of real length n in [1, longest]: the oldest counts in part."""
     a = jnp.asarray(evaluation)
@@ -176,11 +202,13 @@ def soft_windowed(evaluation, n, longest: int):
     return sum(weights[i] * padded[longest - 1 - i : longest - 1 - i + len(a)] for i in range(longest))
 
 
+@door
 def soft_alarm(evaluation, threshold, temperature):
     """A probability of alarm in place of a step of the evaluation at the threshold, its limit for temperature -> 0."""
     return jax.nn.sigmoid((evaluation - threshold) / temperature)
 
 
+@door
 def soft_delay(probability, dt):
     """Expected time [s] to the first alarm, sum_k prod_{j<k} (1 - p_j) dt; at most T dt. probability p: (T, *lanes)."""
     silent = jnp.cumprod(1 - probability, axis=0)
@@ -190,16 +218,19 @@ def soft_delay(probability, dt):
 # chi-square of the innovation, channel by channel
 
 
+@door
 def smoothed(mean, value, memory):
     """The moving mean of normalised innovations after one more, ``value``; memory in (0, 1], 1 for no memory."""
     return mean + memory * (value - mean)
 
 
+@door
 def chi_square(mean, memory):
     """Square of a mean of unit white noise, `smoothed` with this memory, over its variance: chi-square, one degree."""
     return mean * mean * (2 - memory) / memory
 
 
+@door
 def worst_above(statistic, threshold):
     """Which channel, at most one, has the largest statistic and that above the threshold; (n, *lanes) bool."""
     largest = jnp.max(statistic, axis=0)

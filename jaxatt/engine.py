@@ -50,7 +50,7 @@ class System(NamedTuple):
     dt: float  # [s] between ticks
     substeps: int = 1  # RK4 steps between ticks
     normals: int = 0  # standard normal numbers that one tick consumes
-    check: Callable = _no_check  # (params, scenario) -> None, or ValueError on concrete bad input
+    check: Callable = _no_check  # (params, scenario) -> lanes of the scenario, or None; ValueError on bad input
 
 
 def rk4(f: Callable, t, x, h):
@@ -71,8 +71,11 @@ def every(k: int, now: Now, run: Callable, held):
     return jax.lax.cond(now.k % k == 0, run, lambda: held)
 
 
-def _like(tree, example, what: str):
-    """tree with the shapes and dtypes of example, so that a scan can carry it."""
+def like(tree, example, what: str):
+    """tree with the shapes and dtypes of example, so that a scan can carry it; what: the function that made it.
+
+    Raises TypeError where its structure, type or shape cannot be those of the example.
+    """
     if jax.tree.structure(tree) != jax.tree.structure(example):
         raise TypeError(
             f"`{what}` must return the structure {jax.tree.structure(example)}, but it is {jax.tree.structure(tree)}."
@@ -107,11 +110,11 @@ def _step(system: System, params, scenario, k, state, noise):
     dtype = check.float_type((params, scenario))
     now = Now(k, k.astype(dtype) * system.dt, system.dt)
     x, z, log = system.tick(params, scenario, now, *state, noise)
-    x, z = _like((x, z), state, "tick")
+    x, z = like((x, z), state, "tick")
     h = system.dt / system.substeps
 
     def flow(t, x):
-        return once(lambda t, x: _like(system.flow(params, scenario, t, x, z), x, "flow"), t, x)
+        return once(lambda t, x: like(system.flow(params, scenario, t, x, z), x, "flow"), t, x)
 
     if system.substeps == 1:
         x = rk4(flow, now.t, x, h)
@@ -121,11 +124,15 @@ def _step(system: System, params, scenario, k, state, noise):
     return now, (x, z), log
 
 
-def _run(system: System, params, scenario, lanes: int, ticks: int, chunk: int, noise: Callable, fold: Callable, tally):
+def _run(
+    system: System, params, scenario, lanes: int, ticks: int, chunk: int, noise: Callable, fold: Callable, tally,
+    keep: Callable = lambda tally, outs: outs,
+):  # fmt: skip
     """Run the loop for ticks, chunk by chunk; noise(c) gives those of chunk c, shape (chunk, normals, *lanes).
 
-    fold(tally, now, log) -> tally, out is called at every tick. Returns the last tally and the outs, with two
-    leading axes (chunks, chunk); outs past the last tick are zero.
+    fold(tally, now, log) -> tally, out is called at every tick, keep(tally, outs) after every chunk. Returns the last
+    tally and what was kept, the chunks first; by default the outs, then with two leading axes (chunks, chunk). Outs
+    past the last tick are zero.
     """
     chunks = -(-ticks // chunk)
 
@@ -145,7 +152,8 @@ def _run(system: System, params, scenario, lanes: int, ticks: int, chunk: int, n
 
     @jax.checkpoint
     def many(carry, c):
-        return jax.lax.scan(guarded, carry, (c * chunk + jnp.arange(chunk), noise(c)))
+        carry, outs = jax.lax.scan(guarded, carry, (c * chunk + jnp.arange(chunk), noise(c)))
+        return carry, keep(carry[1], outs)
 
     (_, tally), outs = jax.lax.scan(many, (_start(system, params, scenario, lanes), tally), jnp.arange(chunks))
     return tally, outs
@@ -200,7 +208,15 @@ def raw_key(key):
     if hasattr(key, "dtype") and jnp.issubdtype(key.dtype, prng_key):
         key = jax.random.key_data(key)
     if not hasattr(key, "dtype") or key.dtype != jnp.uint32 or key.shape[-1:] != (2,):
-        raise TypeError(f"`key` must be a key of jax.random.key(seed), but it is {key!r}.")
+        raise TypeError(f"`key` must be a key of jax.random.key(seed), but it is {check.short(key)}.")
+    return key
+
+
+def one_key(key):
+    """`raw_key` of what must be a single key; ValueError for several."""
+    key = raw_key(key)
+    if key.ndim != 1:
+        check.refuse("key", "be one key", f"of shape {key.shape[:-1]}")
     return key
 
 
@@ -209,9 +225,14 @@ def _block_key(key, block):
 
 
 def noise_of(system: System, key, index: int, ticks: int):
-    """The noise that scenario ``index`` of a sweep with this key meets, shape (ticks, normals), float32."""
+    """The noise that scenario ``index`` of a sweep with this key meets, shape (ticks, normals), float32.
+
+    Raises ValueError for ticks < 1, index < 0 and more noise than the free memory holds, TypeError for no key.
+    """
     ticks, index = check.whole("ticks", ticks), check.whole("index", index, 0)
-    return compiled(_noise_of, 2, key)(system, ticks, raw_key(key), index // BLOCK, index % BLOCK)
+    key = one_key(key)
+    check.fits_memory(f"`ticks` = {ticks}", 4 * BLOCK * ticks * system.normals, "ask for fewer")
+    return compiled(_noise_of, 2, key)(system, ticks, key, index // BLOCK, index % BLOCK)
 
 
 def _noise_of(system, ticks, key, block, lane):
@@ -228,11 +249,10 @@ def simulate(system: System, params, scenario, noise_or_key, *, ticks: int, ever
     for one scenario, ``jax.random.split(key, n)`` for n lanes. With lanes, every leaf of the scenario carries
     them in its last axis. every: keep the log of ticks 0, every, 2 every, ... Pure: jit, grad and vmap it.
 
-    Raises ValueError on input that the system's check refuses, on ticks or every < 1 and on noise of the wrong
-    shape; TypeError on what is no number or no key.
+    Raises ValueError on input that the system's check refuses, on ticks or every < 1, on noise of the wrong
+    shape and on a log that the free memory does not hold; TypeError on what is no number or no key.
     """
     ticks, every = check.whole("ticks", ticks), check.whole("every", every)
-    params, scenario = admit(system, params, scenario)
     if hasattr(noise_or_key, "dtype") and jnp.issubdtype(noise_or_key.dtype, jnp.floating):
         if noise_or_key.ndim < 2 or noise_or_key.shape[:2] != (ticks, system.normals):
             check.refuse("noise", f"have shape ({ticks}, {system.normals}, *lanes)", noise_or_key.shape)
@@ -241,12 +261,25 @@ def simulate(system: System, params, scenario, noise_or_key, *, ticks: int, ever
         noise_or_key = raw_key(noise_or_key)
         keyed = True
     lanes = noise_or_key.shape[:-1] if keyed else noise_or_key.shape[2:]
+    if 0 in lanes:
+        check.refuse("noise_or_key", "hold at least one lane", f"of lanes {lanes}")
+    params, scenario = admit(system, params, scenario, lanes)
     for path, leaf in jax.tree_util.tree_leaves_with_path(scenario) if lanes else ():
         if leaf.shape[-len(lanes) :] != lanes:
             name = f"scenario{jax.tree_util.keystr(path)}"
             check.refuse(name, f"carry the lanes {lanes} of the noise in its last axis", f"of shape {leaf.shape}")
     operands = params, scenario, noise_or_key
-    return compiled(_simulate, 4, operands)(system, ticks, every, keyed, *operands)
+    run = compiled(_simulate, 4, operands)
+    if not traced(operands):
+        kept = tree_bytes(run.eval_shape(system, ticks, every, keyed, *operands))
+        drawn = 8 * every * system.normals * prod(lanes) * keyed
+        check.fits_memory(f"`ticks` = {ticks} with `every` = {every}", kept + drawn, "keep fewer records, by `every`")
+    return run(system, ticks, every, keyed, *operands)
+
+
+def tree_bytes(shapes) -> int:
+    """Bytes that a tree of arrays, or of their shapes, takes."""
+    return sum(prod(a.shape) * a.dtype.itemsize for a in jax.tree.leaves(shapes))
 
 
 def _simulate(system, ticks, every, keyed, params, scenario, source):
@@ -269,16 +302,32 @@ def _simulate(system, ticks, every, keyed, params, scenario, source):
         def noise(c):
             return chunks[c]
 
-    _, logs = _run(system, params, scenario, len(lanes), ticks, chunk, noise, lambda none, now, log: (none, log), None)
+    run = partial(_run, system, params, scenario, len(lanes), ticks, chunk, noise)
     if every == 1:
+        _, logs = run(lambda none, now, log: (none, log), None)
         return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:ticks], logs)
-    return jax.tree.map(lambda a: a[:, 0], logs)
+
+    def at_start():
+        return _step(
+            system, params, scenario, jnp.asarray(0), _start(system, params, scenario, len(lanes)), noise(0)[0]
+        )[2]
+
+    def hold(held, now, log):  # in the carry, so that what is not kept takes no memory
+        return jax.tree.map(partial(jnp.where, now.k % every == 0), log, held), None
+
+    nothing = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(at_start))
+    return run(hold, nothing, lambda held, _: held)[1]
 
 
-def admit(system: System, params, scenario):
-    """params and scenario through the door: converted, and checked by the system where they are concrete."""
+def admit(system: System, params, scenario, lanes: tuple | None = None):
+    """params and scenario through the door: converted, and checked by the system where they are concrete.
+
+    lanes: those that the scenario must carry, where the caller knows and the system can tell.
+    """
     params, scenario = check.converted(params, scenario)
-    system.check(params, scenario)
+    told = system.check(params, scenario)
+    if lanes is not None and told is not None and told != lanes:
+        check.refuse("scenario", f"carry the lanes {lanes} of the noise or the key", f"of lanes {told}")
     return params, scenario
 
 

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxatt import check
+from jaxatt.check import door
 from jaxatt.vec import Vec3, safe_sqrt
 
 
@@ -55,21 +56,25 @@ def on_axes(fault: Fault) -> Vec3:
     return Vec3(fault, fault, fault)
 
 
+@door
 def active(fault: Fault, t):
     """Whether the fault is on at t [s]: onset <= t < end."""
     return (t >= fault.onset) & (t < fault.end)
 
 
+@door
 def any_active(faults, t):
     """Whether any of the faults, a sequence of `Fault`, is on at t [s]."""
     return reduce(jnp.logical_or, [active(f, t) for f in faults])
 
 
+@door
 def first_onset(faults):
     """The earliest onset [s] of faults, a sequence of `Fault`; inf where there is none."""
     return reduce(jnp.minimum, [f.onset for f in faults])
 
 
+@door
 def channel(fault: Fault, t, std, normal, last) -> Channel:
     """The channel as it reads from tick time t [s] on.
 
@@ -89,6 +94,7 @@ def channel(fault: Fault, t, std, normal, last) -> Channel:
     )
 
 
+@door
 def read(c: Channel, truth):
     """The reading of a channel whose true signal is truth [channel unit]."""
     return c.gain * truth + c.offset

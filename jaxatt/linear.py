@@ -8,6 +8,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from jaxatt import check
+from jaxatt.check import door
 from jaxatt.engine import System, _start, _step, admit
 
 
@@ -22,13 +23,12 @@ def sampled(system: System, params, scenario, *, ticks: int, states: tuple[str, 
     Raises ValueError on ticks < 1 and for a state that x does not have.
     """
     ticks = check.whole("ticks", ticks)
-    params, scenario = admit(system, params, scenario)
+    params, scenario = admit(system, params, scenario, ())
     x0, z0 = _start(system, params, scenario, 0)
     x0 = x0 if start is None else start
     names = x0._fields if states is None else states
-    for name in names:
-        if name not in x0._fields:
-            check.refuse("states", f"be of {x0._fields}", repr(name))
+    if not isinstance(names, tuple) or not names or not set(names) <= set(x0._fields):
+        check.refuse("states", f"be a tuple of {x0._fields}", check.short(names))
     flat, unravel = ravel_pytree({name: getattr(x0, name) for name in names})
     noise = jnp.zeros(system.normals, flat.dtype)
 
@@ -40,6 +40,7 @@ def sampled(system: System, params, scenario, *, ticks: int, states: tuple[str, 
     return jax.jacfwd(run)(flat)
 
 
+@door
 def growth_rates(matrix, period: float) -> np.ndarray:
     """Growth rates log|z| / period [1/s] of a sampled loop's modes, largest first, shape (..., n); matrix (..., n, n).
 
@@ -50,6 +51,7 @@ def growth_rates(matrix, period: float) -> np.ndarray:
         return -np.sort(-np.log(size) / period, axis=-1)
 
 
+@door
 def observability_rank(A, H, scale, *, duration: float, samples: int = 50, tol: float = 1e-8) -> int:
     """How many directions of the state of x' = A x, A (n, n), the readings y = H x, H (m, n), tell apart.
 

@@ -9,11 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxatt import check
+from jaxatt.check import door
 from jaxatt.vec import Vec3, cross, once
 
 # gyros and wheels
 
 
+@door
 def gyro_pyramid(alpha, beta) -> tuple[Vec3, Vec3, Vec3, Vec3]:
     """Input axes of the gyros A, B, C about -z and of the spare D along z; Park (2005), eq. (1).
 
@@ -25,23 +27,27 @@ def gyro_pyramid(alpha, beta) -> tuple[Vec3, Vec3, Vec3, Vec3]:
     return Vec3(o, -sa, -ca), Vec3(sb * sa, cb * sa, -ca), Vec3(-sb * sa, cb * sa, -ca), Vec3(o, o, o + 1)
 
 
+@door
 def wheel_pyramid(gamma) -> tuple[Vec3, Vec3, Vec3, Vec3]:
     """Spin axes of four reaction wheels about z; Park (2005), eq. (2): the columns of W. gamma [rad]."""
     s, c = jnp.sin(gamma), jnp.cos(gamma)
     return Vec3(s * s, s * c, c), Vec3(-s * s, s * c, c), Vec3(-s * s, -s * c, c), Vec3(s * s, -s * c, c)
 
 
+@door
 def along(axes, v: Vec3):
     """Components of v along the axes, shape (n, *lanes): G w for gyros, W' v for wheels."""
     return jnp.stack([a @ v for a in axes])
 
 
+@door
 def total(axes, s) -> Vec3:
     """Sum of s[i] along the axes, s of shape (n, *lanes): W h for wheels."""
     x, y, z = (sum(a[j] * s[i] for i, a in enumerate(axes)) for j in range(3))
     return Vec3(x, y, z)
 
 
+@door
 def parity_vector(axes):
     """Unit v, shape (4, *lanes), with v' G = 0 for four axes no three of which lie in a plane; first v positive.
 
@@ -70,6 +76,7 @@ class Triads(NamedTuple):
     t: Vec3  # [1] r x s = ds/dgamma; the output torque is -h gamma' t
 
 
+@door
 def cmg_axes(skew, azimuth) -> GimbalAxes:
     """Axes of modules round the z axis, Jin & Leeghim (2021), eqs. (8)-(10).
 
@@ -83,6 +90,7 @@ def cmg_axes(skew, azimuth) -> GimbalAxes:
     return GimbalAxes(Vec3(sin_b * cos_a, sin_b * sin_a, cos_b), Vec3(-sin_a, cos_a, m.zeros_like(cos_a)))
 
 
+@door
 def cmg_triads(axes: GimbalAxes, gamma) -> Triads:
     """The triads at gimbal angles gamma [rad], shape (n, *lanes)."""
     sin, cos = once(lambda gamma: (jnp.sin(gamma), jnp.cos(gamma)), gamma)
@@ -90,6 +98,7 @@ def cmg_triads(axes: GimbalAxes, gamma) -> Triads:
     return Triads(axes.r, cos * axes.s0 + sin * t0, cos * t0 - sin * axes.s0)
 
 
+@door
 def modules(axes: GimbalAxes, which) -> GimbalAxes:
     """The cluster of the modules ``which`` alone, a list of indices."""
     which = np.asarray(which)

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jaxatt.check import door
 from jaxatt.vec import safe_sqrt
 
 
@@ -109,43 +110,51 @@ def _where(inside, value, otherwise):
     return value if inside is True else jnp.where(inside, value, otherwise)
 
 
+@door
 def mean(value, inside: Any = True) -> Mean:
     """Tally the mean of value (a bool gives a share) over the ticks where ``inside`` holds."""
     value = jnp.asarray(value, jnp.result_type(value, 1.0))
     return Mean(_where(inside, value, 0), jnp.broadcast_to(jnp.asarray(inside, value.dtype), value.shape))
 
 
+@door
 def rms(square, inside: Any = True) -> Rms:
     """Tally a root mean square where ``inside`` holds; takes the square, for instance ``log.q @ log.q``."""
     return Rms(*mean(square, inside))
 
 
+@door
 def peak(value, inside: Any = True) -> Peak:
     """Tally the largest value over the ticks where ``inside`` holds."""
     return Peak(_where(inside, value, -jnp.inf))
 
 
+@door
 def first(now, condition, since: Any = 0.0) -> First:
     """Tally the first time [s], counted from ``since``, at which the condition holds."""
     return First(jnp.where(condition, now.t - since, jnp.inf))
 
 
+@door
 def settling(now, outside, inside: Any = True) -> Settling:
     """Tally the settling time [s]: the last time at which ``outside`` holds, in the window ``inside``."""
     end = _where(inside, jnp.broadcast_to(now.t, jnp.shape(outside)), -jnp.inf)
     return Settling(jnp.where(outside, end, -jnp.inf), end)
 
 
+@door
 def always(condition) -> Always:
     """Tally whether the condition holds at every tick."""
     return Always(condition)
 
 
+@door
 def final(value) -> Final:
     """Tally the value at the last tick."""
     return Final(value)
 
 
+@door
 def finite(tree):
     """Whether every number of a tree of (*lanes) leaves is finite, shape (*lanes)."""
     total = sum(jax.tree.leaves(tree))  # one inf or NaN makes the sum inf or NaN
@@ -188,6 +197,7 @@ class Span(NamedTuple):
         return jnp.where(self.largest == -jnp.inf, jnp.nan, self.largest - self.smallest)
 
 
+@door
 def span(value, inside: Any = True) -> Span:
     """Tally how far apart the extremes of value lie over the ticks where ``inside`` holds."""
     return Span(_where(inside, value, -jnp.inf), _where(inside, value, jnp.inf))
@@ -222,11 +232,13 @@ class PeakTime(NamedTuple):
         return self.t
 
 
+@door
 def total(value, inside=True) -> Total:
     """Tally the sum of value over the ticks where ``inside`` holds."""
     return Total(_where(inside, jnp.asarray(value, jnp.result_type(value, 1.0)), 0))
 
 
+@door
 def peak_time(now, value) -> PeakTime:
     """Tally the time [s] of the largest value."""
     return PeakTime(value, jnp.broadcast_to(now.t, jnp.shape(value)))

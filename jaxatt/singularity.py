@@ -18,38 +18,45 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxatt import check
+from jaxatt.check import door
 from jaxatt.mounting import GimbalAxes, check_gimbal_axes, cmg_triads
 from jaxatt.vec import Mat3, Vec3, cross, diagonal, norm, safe_sqrt
 
 # the torque matrix
 
 
+@door
 def columns(t: Vec3) -> list[Vec3]:
     """The columns of T, components of shape (*lanes)."""
     return [Vec3(*column) for column in zip(*t)]
 
 
+@door
 def minors(t: list[Vec3]) -> dict[tuple[int, int, int], Any]:
     """det [t_i t_j t_k] of the columns i < j < k, shape (*lanes)."""
     return {(i, j, k): t[i] @ cross(t[j], t[k]) for i, j, k in combinations(range(len(t)), 3)}
 
 
+@door
 def gram_determinant(t: Vec3):
     """det(T T') = (sigma_1 sigma_2 sigma_3)^2 as the sum of the squared minors (Cauchy-Binet): never cancels."""
     return sum(d * d for d in minors(columns(t)).values())
 
 
+@door
 def singular_values(t: Vec3) -> Vec3:
     """Singular values of T, largest first, shape (*lanes); the smallest to rounding of T, not of T T'."""
     l1, l2, l3 = _squares(columns(t))
     return Vec3(safe_sqrt(l1), safe_sqrt(l2), safe_sqrt(l3))
 
 
+@door
 def condition(t: Vec3):
     """Condition number sigma_1 / sigma_3 of T, eq. (3), shape (*lanes); inf where rank T < 3."""
     return condition_and_rank(t)[0]
 
 
+@door
 def condition_and_rank(t: Vec3):
     """`condition`, and whether sigma_2 < 1e-6 sigma_1: T of rank one, from which no gimbal motion helps at first."""
     sigma = singular_values(t)
@@ -100,16 +107,19 @@ def _squares(t: list[Vec3]):
 # solving T x = a
 
 
+@door
 def times(t: Vec3, x) -> Vec3:
     """T x for x of shape (n, *lanes); T' a for a `Vec3` a is t @ a."""
     return Vec3(*(jnp.sum(row * x, axis=0) for row in t))
 
 
+@door
 def gram(t: Vec3) -> Mat3:
     """T T', components of shape (*lanes)."""
     return Mat3(*(times(t, row) for row in t))
 
 
+@door
 def min_norm_solve(t: Vec3, a: Vec3, rcond):
     """The pseudo-inverse of T times a, shape (n, *lanes): of all least-squares solutions the shortest.
 
@@ -133,6 +143,7 @@ def min_norm_solve(t: Vec3, a: Vec3, rcond):
     return jnp.where(l3 > least, full, jnp.where(l2 > least, two, one))
 
 
+@door
 def robust_solve(t: Vec3, a: Vec3, E: Mat3):
     """T' (T T' + E)^-1 a, shape (n, *lanes): the singularity-robust inverse with damping E."""
     return t @ (_inverse(gram(t) + E) @ a)
@@ -158,6 +169,7 @@ def _kernel(m: Mat3) -> Vec3:
 # grids
 
 
+@door
 def ill_conditioned(axes: GimbalAxes, points: int, threshold=100.0) -> tuple[int, int]:
     """How many of the points^n gimbal-angle combinations have condition >= threshold, and points^n (Table 3).
 
@@ -197,6 +209,7 @@ def _count(axes: GimbalAxes, kept: int, points: int, threshold):
 # singular momenta
 
 
+@door
 def singular_momentum(axes: GimbalAxes, u: Vec3, signs):
     """Momentum and gimbal angles of the singular state in direction u: h `Vec3` (m,), gamma (n, m) [rad].
 
@@ -214,6 +227,7 @@ def singular_momentum(axes: GimbalAxes, u: Vec3, signs):
     return h, jnp.arctan2(s @ cross(at.r, at.s0), s @ at.s0)
 
 
+@door
 def sign_patterns(n: int) -> np.ndarray:
     """The 2^(n-1) patterns of signs, shape (patterns, n), first sign +: the others are these with u and e reversed."""
     return np.array([(1, *rest) for rest in product((1, -1), repeat=n - 1)])
@@ -231,6 +245,7 @@ class Rim(NamedTuple):
     external: bool  # all other signs equal
 
 
+@door
 def rims(axes: GimbalAxes) -> list[Rim]:
     """The rims of all holes u = r_i, for all signs of the other modules; u = -r_i gives the same set."""
     r = np.stack([np.asarray(c, float) for c in axes.r], axis=-1)
@@ -247,6 +262,7 @@ def rims(axes: GimbalAxes) -> list[Rim]:
     return found
 
 
+@door
 def clearance(axes: GimbalAxes, h) -> float:
     """Distance of the momentum h, shape (3,), from the nearest singular momentum: 0 on the singular surfaces.
 
@@ -271,6 +287,7 @@ def _distance(axes: GimbalAxes, u: Vec3, signs, h: Vec3):
     return jnp.nan_to_num(norm(singular_momentum(axes, u, signs)[0] - h), nan=jnp.inf)
 
 
+@door
 def sphere(m: int) -> Vec3:
     """m nearly even unit vectors (Fibonacci's spiral), shape (m,)."""
     z = 1 - (2 * np.arange(m) + 1) / m
@@ -300,12 +317,14 @@ def _least(f: Callable, u: Vec3, keep: int = 8, rounds: int = 40) -> tuple[np.nd
 # the momentum envelope
 
 
+@door
 def support(axes: GimbalAxes, u: Vec3):
     """Largest u.h of the cluster, shape (m,): the support of the envelope's convex hull, for unit vectors u."""
     along = _with_lanes(axes).r @ u
     return safe_sqrt(jnp.maximum(1 - along * along, 0)).sum(0)
 
 
+@door
 def reach(axes: GimbalAxes, d: Vec3):
     """Largest |h| that the cluster holds along the unit vectors d, shape (m,).
 
@@ -361,6 +380,7 @@ class Envelope(NamedTuple):
     largest: float  # |h|
 
 
+@door
 def envelope(axes: GimbalAxes, m: int = 1500) -> Envelope:
     """The momentum envelope over m nearly even directions, its least and largest radius refined."""
     d = sphere(m)
@@ -373,6 +393,7 @@ def envelope(axes: GimbalAxes, m: int = 1500) -> Envelope:
 # the singular set in gimbal space
 
 
+@door
 def singular_area(axes: GimbalAxes, m: int = 500) -> float:
     """Area of the set det T = 0 of three modules in the space of their gimbal angles, in units of (2 pi)^2.
 
@@ -409,6 +430,7 @@ def _area(axes: GimbalAxes, m: int):
     return total
 
 
+@door
 def passability(axes: GimbalAxes, gamma) -> np.ndarray:
     """Eigenvalues, ascending, shape (n - 2, *lanes), of N' diag(u.s_i) N at singular angles gamma (n, *lanes).
 
@@ -436,6 +458,7 @@ class Rearrangement(NamedTuple):
     condition: np.ndarray  # (k,)
 
 
+@door
 def rearrange(axes: GimbalAxes, gamma, step=np.pi / 36, rank: Callable | None = None) -> Rearrangement:
     """All gimbal angles of least condition among gamma and its neighbours by -step, 0, +step [rad] in each module.
 
@@ -452,6 +475,7 @@ def rearrange(axes: GimbalAxes, gamma, step=np.pi / 36, rank: Callable | None = 
     return Rearrangement(options[tied], kappa[tied])
 
 
+@door
 def rearrange_by_gradient(axes: GimbalAxes, gamma, limit=np.pi / 36) -> Rearrangement:
     """The gimbal angles of three modules within +-limit [rad] of gamma with the largest and the smallest det T.
 

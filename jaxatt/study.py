@@ -1,4 +1,4 @@
-"""Studies: what one does with a closed loop, in memory: sweep many scenarios, rerun one, tune by gradient."""
+"""Studies: what one does with a closed loop, in memory: sweep many scenarios, rerun one."""
 
 from __future__ import annotations
 
@@ -7,17 +7,14 @@ from collections import deque
 from collections.abc import Callable
 from functools import lru_cache
 from math import prod
-from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
-from jax.flatten_util import ravel_pytree
-from tqdm.auto import tqdm
+from tqdm import tqdm
 
 from jaxatt import check
-from jaxatt.engine import BLOCK, System, admit, block_log, block_scores, compiled, raw_key, traced
+from jaxatt.engine import BLOCK, System, admit, block_log, block_scores, compiled, one_key, traced, tree_bytes
 
 
 def sweep(system: System, params, scenarios, key, *, ticks: int, score: Callable, progress: bool | None = None):
@@ -34,8 +31,9 @@ def sweep(system: System, params, scenarios, key, *, ticks: int, score: Callable
     for what is no number or no key.
     """
     ticks, n = check.whole("ticks", ticks), check.lanes(scenarios)
-    params, scenarios = admit(system, params, scenarios)
-    key = raw_key(key)
+    check.function("score", score)
+    params, scenarios = admit(system, params, scenarios, (n,))
+    key = one_key(key)
     blocks = -(-n // BLOCK)
     if traced(params, scenarios, key):
         return _traced(system, score, ticks, params, scenarios, key, n, blocks)
@@ -133,92 +131,18 @@ def rerun(system: System, params, scenarios, key, index: int, *, ticks: int):
     index = check.whole("index", index, 0)
     if index >= n:
         check.refuse("index", f"be less than the {n} scenarios", index)
-    params, scenarios = admit(system, params, scenarios)
+    params, scenarios = admit(system, params, scenarios, (n,))
     here = _lanes_of(jax.tree.map(np.asarray, scenarios), index // BLOCK)
-    return logged(system, params, here, key, index, ticks)
+    return logged(system, params, here, one_key(key), index, ticks)
 
 
 def logged(system, params, here, key, index: int, ticks: int):
     """What `rerun` gives, of admitted input: here are the `BLOCK` scenarios of the block that holds ``index``."""
     block, lane = divmod(index, BLOCK)
-    return compiled(block_log, 2)(system, ticks, params, here, raw_key(key), np.int32(block), np.int32(lane))
-
-
-FEW = 6  # numbers up to which forward mode is the cheaper
-
-
-def value_and_gradient(cost: Callable, theta, key):
-    """cost(theta, key), a scalar, and its gradient, a tree like theta.
-
-    Up to `FEW` numbers by forward mode: it costs less than reverse mode there, compiles in a quarter of the time
-    and keeps no history. Pure.
-
-    Raises TypeError if the cost is no scalar.
-    """
-    flat, unravel = ravel_pytree(theta)
-    if jax.eval_shape(cost, theta, key).shape != ():
-        raise TypeError(f"`cost` must be a scalar, but its shape is {jax.eval_shape(cost, theta, key).shape}.")
-    if flat.size > FEW:
-        return jax.value_and_grad(cost)(theta, key)
-    along = lambda direction: jax.jvp(lambda a: cost(unravel(a), key), (flat,), (direction,))
-    value, slopes = jax.vmap(along, out_axes=(None, 0))(jnp.eye(flat.size, dtype=flat.dtype))
-    return value, unravel(slopes)
-
-
-class History(NamedTuple):
-    """What `tune` met, step by step; every leaf leads with the steps."""
-
-    theta: Any  # (steps, ...) parameters at which the step was taken
-    cost: Any  # (steps,) their cost
-    gradient: Any  # (steps,) norm of the gradient
-    step: Any  # (steps,) [1] factor on the optimizer's update: below 1 after a step that ended in NaN
-
-
-def tune(cost: Callable, theta, optimizer, steps: int, key, *, progress: bool | None = None) -> tuple[Any, History]:
-    """Minimise cost(theta, key), a scalar, over a pytree theta; returns the best theta met and the `History`.
-
-    Every step sees the same key: with common random numbers the cost is a smooth function and "best" has a
-    meaning. optimizer: any of optax. A step that ends in a cost or gradient that is not finite is taken back:
-    the search goes on from the best theta with updates half as long. Gains that must stay positive are tuned as
-    logarithms.
-
-    Raises ValueError if the cost is not finite at the start or steps < 1, TypeError if it is no scalar.
-    """
-    steps = check.whole("steps", steps)
-    theta = jax.tree.map(lambda a: jnp.asarray(a, jnp.result_type(a, float)), theta)
-
-    def step(theta, state, factor):
-        value, gradient = value_and_gradient(cost, theta, key)
-        size = optax.global_norm(gradient)
-        more = dict(value=value, grad=gradient, value_fn=lambda theta: cost(theta, key)) if line_search else {}
-        updates, state = optimizer.update(gradient, state, theta, **more)
-        updates = jax.tree.map(lambda u: factor * u, updates)
-        return value, size, optax.apply_updates(theta, updates), state
-
-    line_search = isinstance(optimizer, optax.GradientTransformationExtraArgs)
-    step = compiled(step, 0)
-    state, factor = optimizer.init(theta), 1.0
-    best = (np.inf, theta, state)
-    trail = []
-    with _bar(progress, steps, " steps") as bar:
-        for _ in range(steps):
-            value, size, ahead, ahead_state = step(theta, state, factor)
-            value, size = float(value), float(size)
-            trail.append((theta, value, size, factor))
-            if np.isfinite(value) and np.isfinite(size):
-                if value < best[0]:
-                    best = (value, theta, state)
-                theta, state = ahead, ahead_state
-            elif np.isinf(best[0]):
-                check.refuse("cost", "be finite, with a finite gradient, at the start", value)
-            else:
-                _, theta, state = best
-                factor /= 2
-            bar.set_postfix(cost=f"{value:.4g}", refresh=False)
-            bar.update()
-    thetas, values, sizes, factors = zip(*trail)
-    stacked = jax.tree.map(lambda *a: np.stack(a), *thetas)
-    return best[1], History(stacked, np.array(values), np.array(sizes), np.array(factors))
+    operands = params, here, key, np.int32(block), np.int32(lane)
+    run = compiled(block_log, 2)
+    check.fits_memory(f"`ticks` = {ticks}", tree_bytes(run.eval_shape(system, ticks, *operands)), "ask for fewer")
+    return run(system, ticks, *operands)
 
 
 @lru_cache
@@ -237,4 +161,11 @@ def varied(system: System) -> System:
 
 def batch(tree, n: int):
     """One scenario, a tree, n times: every leaf, of shape (...), gets the n scenarios as its last axis, (..., n)."""
-    return jax.tree.map(lambda leaf: np.broadcast_to(np.asarray(leaf)[..., None], (*np.shape(leaf), n)), tree)
+    n = check.whole("n", n)
+
+    def repeated(leaf):
+        if not check.is_number(leaf):
+            raise TypeError(f"`tree` must hold numbers, but it holds {check.short(leaf)}.")
+        return np.broadcast_to(np.asarray(leaf)[..., None], (*np.shape(leaf), n))
+
+    return jax.tree.map(repeated, tree)

@@ -5,7 +5,7 @@ Takes the `xarray.Dataset` of `jaxatt.campaign.dataset`; one variable is in memo
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,6 +33,20 @@ def rate_of(successes: int, trials: int, level: float = 0.95) -> Rate:
     low = 0.0 if k == 0 else float(stats.beta.ppf(tail, k, n - k + 1))
     high = 1.0 if k == n else float(stats.beta.isf(tail, k + 1, n - k))
     return Rate(k, n, low, high)
+
+
+def narrowed(counts: Iterable[int], looks, half_width: float, level: float = 0.95) -> Rate:
+    """The rate at the first look at which its interval is at most ``half_width`` to a side, or at the last.
+
+    counts: successes among the first looks[0], looks[1], ... trials, asked for one by one. The error 1 - level is
+    shared out equally among the looks (Bonferroni) and each interval is that of `rate_of`, so the one returned
+    covers the rate of independent trials with probability of at least ``level``, wherever it stopped.
+    """
+    for successes, n in zip(counts, looks):
+        rate = rate_of(successes, n, 1 - (1 - level) / len(looks))
+        if (rate.high - rate.low) / 2 <= half_width:
+            break
+    return rate
 
 
 def columns(dataset, role: str) -> Iterator[tuple[str, np.ndarray]]:

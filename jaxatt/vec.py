@@ -2,7 +2,6 @@
 
 Components lead, lanes trail: every component is a scalar or an array of lanes, and batching is plain
 broadcasting. XLA sees nothing but element-wise arithmetic, which it fuses and vectorises.
-Imports nothing of jaxatt.
 """
 
 from __future__ import annotations
@@ -12,6 +11,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax.core import Tracer
+
+from jaxatt.check import door
 
 
 class Vec3(NamedTuple):
@@ -117,23 +118,27 @@ class Quat(NamedTuple):
         return self.w * p.w + self.v @ p.v
 
 
+@door
 def vec3(a) -> Vec3:
     """Array-like a of shape (3, *lanes) to `Vec3`."""
     x, y, z = a
     return Vec3(x, y, z)
 
 
+@door
 def mat3(a) -> Mat3:
     """Array-like a of shape (3, 3, *lanes) to `Mat3`."""
     return Mat3(*(vec3(row) for row in a))
 
 
+@door
 def quat(a) -> Quat:
     """Array-like of shape (4, *lanes), scalar first, to `Quat`."""
     w, x, y, z = a
     return Quat(w, x, y, z)
 
 
+@door
 def array(v) -> jax.Array:
     """`Vec3`, `Quat` or `Mat3` to an array of shape (3, *lanes), (4, *lanes) or (3, 3, *lanes)."""
     if isinstance(v, Mat3):
@@ -141,6 +146,7 @@ def array(v) -> jax.Array:
     return jnp.stack(jnp.broadcast_arrays(*v))
 
 
+@door
 def diagonal(d) -> Mat3:
     """The diagonal matrix of three numbers or a `Vec3`."""
     x, y, z = d
@@ -148,27 +154,32 @@ def diagonal(d) -> Mat3:
     return Mat3(Vec3(x, o, o), Vec3(o, y, o), Vec3(o, o, z))
 
 
+@door
 def cross(a: Vec3, b: Vec3) -> Vec3:
     """Vector product a x b."""
     return Vec3(a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x)
 
 
+@door
 def det(m: Mat3):
     """Determinant, as the triple product of the rows."""
     return m.x @ cross(m.y, m.z)
 
 
+@door
 def inverse(m: Mat3) -> Mat3:
     """Inverse in closed form (adjugate over determinant); infinities for a singular matrix."""
     columns = Mat3(cross(m.y, m.z), cross(m.z, m.x), cross(m.x, m.y))
-    return columns.T * (1 / (m.x @ columns.x))
+    return columns.T * (1 / jnp.asarray(m.x @ columns.x))  # a Python zero would raise
 
 
+@door
 def norm(v):
     """Euclidean length of a `Vec3` or `Quat`, shape (*lanes); its gradient at zero is zero, not NaN."""
     return safe_sqrt(v @ v)
 
 
+@door
 def safe_sqrt(a):
     """Square root of a >= 0 whose gradient at zero is zero, not infinite."""
     positive = a > 0

@@ -12,7 +12,8 @@ PLAIN = {"vec", "check"}
 ALGEBRA = {"attitude", "faults", "mounting", "scores"}
 PARTS = {"bodies", "sensors", "estimators", "kalman", "lmmse", "controllers", "detection", "singularity"}
 MAY = {
-    **{name: set() for name in PLAIN},
+    "check": set(),
+    "vec": {"check"},
     **{name: PLAIN for name in ALGEBRA},
     **{name: PLAIN | ALGEBRA for name in PARTS},
     "controllers": PLAIN | ALGEBRA | {"singularity"},
@@ -22,6 +23,10 @@ MAY = {
     "designs": {"check"},
     "summary": {"check"},
     "campaign": {"check", "engine", "study", "summary"},
+    "tuning": {"check", "engine", "study"},
+    "objectives": PLAIN | ALGEBRA,
+    "replay": PLAIN | {"faults", "engine"},
+    "plot": PLAIN | ALGEBRA | PARTS,
     "systems": PLAIN | ALGEBRA | PARTS | {"engine"},
 }
 

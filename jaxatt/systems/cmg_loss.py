@@ -39,6 +39,7 @@ class Params(NamedTuple):
     J: Mat3 = Mat3(Vec3(50.0, 0.0, 0.0), Vec3(0.0, 50.0, 0.0), Vec3(0.0, 0.0, 30.0))  # [kg m^2] believed, J_S
     module: ModuleInertia = MODULE  # believed
     spin: Any = 600.0  # () [rad/s] believed wheel speed: h_w = I_ws spin
+    limit: Any = np.inf  # () [rad/s] smooth limit of the commands, limit tanh(u / limit); inf: the drives' alone
 
 
 class Failure(NamedTuple):
@@ -84,7 +85,7 @@ class Board(NamedTuple):
 
     axes: GimbalAxes  # (n,)
     integral: Vec3  # [rad] of the rate error
-    u: Any  # (n,) [rad/s] gimbal-rate command before the limit
+    u: Any  # (n,) [rad/s] gimbal-rate command before the drives' limit
 
 
 class Drive(NamedTuple):
@@ -181,9 +182,17 @@ def decide(params: Params, now, board: Board, y: Readings):
         J_T = cluster_inertia(params.J, cmg_triads(board.axes, y.gamma), params.module)
         torque = rate_pi(e, integral, J_T, params.k_p, params.k_i)
         a = -torque / (params.module.I_ws * params.spin)  # eq. (7): the gimbals give -h_w T rate
-        return board._replace(integral=integral, u=steer(params.steering, a, board.axes, y.gamma, y.healthy, now.t))
+        u = steer(params.steering, a, board.axes, y.gamma, y.healthy, now.t)
+        return board._replace(integral=integral, u=smoothly_limited(u, params.limit))
 
     return every(PERIOD, now, control, board), ()
+
+
+def smoothly_limited(u, limit):
+    """limit tanh(u / limit), u itself where the limit is inf. Its slope is nowhere zero, as a hard limit's is."""
+    there = jnp.isfinite(limit)
+    safe = jnp.where(there, limit, 1)
+    return jnp.where(there, safe * jnp.tanh(u / safe), u)
 
 
 def tick(params: Params, scenario: Scenario, now, x: X, z: Z, noise):
@@ -257,8 +266,9 @@ def classify(run: Scores):
     return np.where(~(variation <= 20), FLUCTUATION, np.where(ratio > 0.2, LOCK, PROPER))
 
 
-def refuse_bad(params: Params, scenario: Scenario) -> None:
-    """The system's check: ValueError on input outside physics' domain."""
+def refuse_bad(params: Params, scenario: Scenario) -> tuple:
+    """The system's check: ValueError on input outside physics' domain; returns the lanes."""
+    lanes = check.shapes(params, scenario, Params(), _shaped(scenario))
     check.moments("params.J", params.J)
     check.moments("scenario.J", scenario.J)
     for name in ("k_p", "k_i"):
@@ -266,6 +276,7 @@ def refuse_bad(params: Params, scenario: Scenario) -> None:
     for name in Steering._fields:
         check.not_negative(f"params.steering.{name}", getattr(params.steering, name))
     check.positive("params.spin", params.spin)
+    check.above("params.limit", params.limit, 0, "inf for no limit")
     for name in ModuleInertia._fields:
         check.positive(f"params.module.{name}", getattr(params.module, name))
         check.positive(f"scenario.module.{name}", getattr(scenario.module, name))
@@ -282,6 +293,19 @@ def refuse_bad(params: Params, scenario: Scenario) -> None:
         check_gimbal_axes("scenario.axes", scenario.axes, np.isinf(np.asarray(scenario.failure.onset)))
         if scenario.known is not None:
             check_gimbal_axes("scenario.known", scenario.known)
+    return lanes
+
+
+def _shaped(scenario: Scenario) -> Scenario:
+    """A scenario of the shapes that this one must have, for as many modules as it has gimbal angles."""
+    check.kind("scenario", scenario, Scenario)
+    n = np.shape(scenario.gamma)[:1]
+    if not n:
+        check.refuse("scenario.gamma", "have shape (n, *lanes)", "()")
+    each = np.zeros(n)
+    axes = GimbalAxes(Vec3(each, each, each), Vec3(each, each, each))
+    known = None if scenario.known is None else axes
+    return Scenario(each, Failure(each, each, each, each), axes, known, each, each)
 
 
 def lost(skew, gamma, module: int = 3, onset=0.0, brake=1e-6, free=0.0, friction=0.0) -> Scenario:

@@ -316,7 +316,7 @@ def suspect(params: Params, now, board: Board, prior: Belief, y: Readings) -> Su
 
 
 def decide_direct(params: Params, now, board: DirectBoard, y: Readings):
-    """One tick of the computer without a filter: the rate by pseudo-inverse of the gyros in use."""
+    """One tick of the computer without a filter: the rate by pseudo-inverse of the gyros in use. No log."""
 
     def law():
         a, b, c, d = y.gyro.valid
@@ -327,7 +327,7 @@ def decide_direct(params: Params, now, board: DirectBoard, y: Readings):
         w = Vec3(*(sum(row[i] * used[i] for i in range(4)) for row in chosen))
         return command(params, now, y.up, vec3(y.integral), vec3(y.angle.value), w)
 
-    return board._replace(u=every(CONTROL, now, law, board.u))
+    return board._replace(u=every(CONTROL, now, law, board.u)), ()
 
 
 # the two closed loops
@@ -366,7 +366,7 @@ def tick(params: Params, scenario: Scenario, now, x: X, z: Z, noise):
 def tick_direct(params: Params, scenario: Scenario, now, x: X, z: Z, noise):
     """One tick of the loop without a filter."""
     readings = sense(params, scenario, now, x, z, noise)
-    board = decide_direct(params, now, z.board, readings)
+    board, _ = decide_direct(params, now, z.board, readings)
     z = z._replace(readings=readings, board=board, motors=motors(scenario, now))
     return x, z, report(params, now, x, board.u, None)
 
@@ -451,8 +451,16 @@ def consistent(params: Params) -> Params:
     return params._replace(R=R, Q=1e-8 * np.asarray(Params().Q), P0=P0)
 
 
-def refuse_bad(params: Params, scenario: Scenario) -> None:
-    """The system's check: ValueError on input outside physics."""
+def refuse_bad(params: Params, scenario: Scenario) -> tuple:
+    """The system's check: ValueError on input outside physics; returns the lanes."""
+    lanes = check.shapes(params, scenario, Params(), Scenario()._replace(gyro=None, wheel=None))
+    for name in ("gyro", "wheel"):  # one number for all four, or four
+        fault = getattr(scenario, name)
+        check.kind(f"scenario.{name}", fault, Fault)
+        shaped = Fault(*(np.zeros(4) if np.ndim(a) > len(lanes) else 0.0 for a in fault))
+        its = check.lanes_of(f"scenario.{name}", fault, shaped)
+        if its != lanes:
+            check.refuse(f"scenario.{name}", f"carry the lanes of the others, {lanes}", its)
     check.moments("params.J", params.J)
     check.moments("scenario.J", scenario.J)
     for name in ("k_f", "k_p", "k_i", "k_d", "slew"):
@@ -486,6 +494,7 @@ def refuse_bad(params: Params, scenario: Scenario) -> None:
         check.one_of(f"scenario.{name}", getattr(scenario, name), (0, 1))
     for name in ("gyro", "wheel", "sun", "earth"):
         check_fault(f"scenario.{name}", getattr(scenario, name))
+    return lanes
 
 
 system = System(init, tick, flow, dt=DT, normals=11, check=refuse_bad)

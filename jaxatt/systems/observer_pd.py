@@ -16,7 +16,7 @@ from numpy import sqrt
 from jaxatt import check, scores
 from jaxatt.attitude import mrp_error, mrp_inner, mrp_nearest, mrp_rate
 from jaxatt.bodies import body_acceleration
-from jaxatt.controllers import adapted_rate_gain, pd, saturated
+from jaxatt.controllers import adapted_rate_gain, pd, rate_gain_floor, saturated
 from jaxatt.engine import System
 from jaxatt.estimators import AttitudeRate, mrp_observer, residual_norm
 from jaxatt.faults import Channel, Fault, any_active, check_fault, first_onset, on_axes
@@ -170,10 +170,11 @@ def command(params: Params, board: Board, y: AttitudeRate) -> Vec3:
     return saturated(pd(e.q, e.w, params.k_q, board.k_w), params.u_max)
 
 
-def board_flow(params: Params, board: Board, y: AttitudeRate) -> AttitudeRate:
-    """Rate of change of the on-board continuous state, the observer's estimate (7)."""
+def board_flow(params: Params, board: Board, y: AttitudeRate) -> dict[str, Any]:
+    """Rates of what moves on board between ticks: the observer's estimate (7)."""
     u = command(params, board, y)
-    return mrp_observer(board.estimate, y, u, params.J, board.J_inv, params.alpha, params.beta, params.sign)
+    rate = mrp_observer(board.estimate, y, u, params.J, board.J_inv, params.alpha, params.beta, params.sign)
+    return dict(estimate=rate)
 
 
 def tick(params: Params, scenario: Scenario, now, x: X, z: Z, noise):
@@ -194,7 +195,7 @@ def flow(params: Params, scenario: Scenario, t, x: X, z: Z) -> X:
     return X(
         q=mrp_rate(x.q, x.w),  # eq. (1)
         w=body_acceleration(x.w, u, scenario.J, z.J_inv, scenario.sign),  # eq. (4), sign: erratum 1
-        estimate=board_flow(params, board, y),
+        **board_flow(params, board, y),
     )
 
 
@@ -224,8 +225,35 @@ def score(params: Params, scenario: Scenario, now, log: Log) -> Scores:
     )
 
 
-def refuse_bad(params: Params, scenario: Scenario) -> None:
-    """The system's check: ValueError on input outside the paper's and physics' domain."""
+class Margins(NamedTuple):
+    """What the paper's proof of stability leaves; all positive: it holds there."""
+
+    k_q: Any  # [N m] above the least attitude gain, eq. (18)
+    eps: Any  # [1/s] below the largest epsilon with Q > 0, after eq. (12)
+    T: Any  # [N m/s] of T_I > 0, eq. (16), for constant gains
+
+
+def margins(params: Params, lambda_max, e_q=0.0, e_w=0.0) -> Margins:
+    """The margins at tracking errors of norms e_q [1] and e_w [rad/s], with k_w = k_w0.
+
+    lambda_max: largest principal moment of the believed inertia [kg m^2]. Pure: its penalty keeps a search of gains
+    where the proof holds. The adaptation (19) leaves that region in time whatever the gains are (spec, 5.7).
+    """
+    eps, k_q = params.eps, params.k_q
+    c = eps * lambda_max * e_w + 1 + e_q * e_q
+    room = params.k_w0 - rate_gain_floor(Vec3(e_q, 0.0, 0.0), eps, lambda_max)
+    positive = room > 0
+    held = eps * k_q - 0.5 * eps * eps - 1 - c * c / jnp.where(positive, room, 1)
+    return Margins(
+        k_q=k_q - eps / 2 - 1 / eps,
+        eps=2 / jnp.sqrt(lambda_max) - eps,
+        T=jnp.where(positive, held, room - 1),
+    )
+
+
+def refuse_bad(params: Params, scenario: Scenario) -> tuple:
+    """The system's check: ValueError on input outside the paper's and physics' domain; returns the lanes."""
+    lanes = check.shapes(params, scenario, Params(), Scenario())
     moments = check.moments("params.J", params.J)
     for name in ("alpha", "beta", "sigma", "k_q", "k_w0"):
         check.positive(f"params.{name}", getattr(params, name))
@@ -245,6 +273,7 @@ def refuse_bad(params: Params, scenario: Scenario) -> None:
     for name in ("star", "gyro"):
         for axis, fault in getattr(scenario, name)._asdict().items():
             check_fault(f"scenario.{name}.{axis}", fault)
+    return lanes
 
 
 system = System(init, tick, flow, dt=DT, substeps=4, normals=6, check=refuse_bad)

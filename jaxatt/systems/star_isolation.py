@@ -346,25 +346,6 @@ def decide(params: Params, now, board: Board, readings: Readings, generator: Gen
     return Board(filters, readings.gyro, recent, latched, u), verdict
 
 
-def replay(generator: Generator, params: Params, q_hat: Quat, readings: Readings, dt: float = DT) -> Innovation:
-    """Innovations of both filters on recorded readings, time first, shape (T - 1, 2, *lanes); for likelihoods.
-
-    q_hat: initial estimates, (2, *lanes); readings: a run's ``log.readings``, unit-normalised or not as they are;
-    dt: between them [s].
-    """
-
-    def step(carry, told):
-        filters, gyro = carry
-        filters, innovation = advanced(generator, params, filters, gyro, told.stars, dt)
-        return (filters, told.gyro), innovation
-
-    filters = jax.vmap(partial(generator.start, params))(q_hat)
-    lanes = readings.gyro.x.shape[1:]
-    wide = lambda a: jnp.broadcast_to(a.reshape(a.shape + (1,) * (len(lanes) + 1 - a.ndim)), (2, *lanes))
-    first, later = (jax.tree.map(lambda a, part=part: a[part], readings) for part in (0, slice(1, None)))
-    return jax.lax.scan(jax.checkpoint(step), (jax.tree.map(wide, filters), first.gyro), later)[1]
-
-
 def star_angle(pointing: Vec3, params: Params):
     """Squared error of the cosine between the two measured stars in units of its variance: needs no gyro, no filter.
 
@@ -471,8 +452,12 @@ def _within_range(name: str, q: Quat) -> None:
             )
 
 
-def refuse_bad(generator: Generator, params: Params, scenario: Scenario) -> None:
-    """The system's check: ValueError on bad input, a warning for pointing beyond the filter's linear range."""
+def refuse_bad(generator: Generator, params: Params, scenario: Scenario) -> tuple:
+    """The system's check: ValueError on bad input, a warning for pointing beyond the filter's linear range.
+
+    Returns the lanes.
+    """
+    lanes = check.shapes(params, scenario, Params(), Scenario())
     for name in ("std_gyro", "std_star", "std_q0", "std_qv", "std_bias", "threshold", "angle_threshold"):
         check.positive(f"params.{name}", getattr(params, name))
     for name in ("bandwidth", "damping", "u_max"):
@@ -499,6 +484,7 @@ def refuse_bad(generator: Generator, params: Params, scenario: Scenario) -> None
     for name in ("star", "gyro", "actuator"):
         for axis, fault in getattr(scenario, name)._asdict().items():
             check_fault(f"scenario.{name}.{axis}", fault)
+    return lanes
 
 
 def system_of(generator: Generator = LMMSE, window: int = 1, dt: float = DT) -> System:

@@ -243,6 +243,18 @@ def decide_sampled(params: Params, now, board: Board, readings: Readings):
     return board._replace(mrac=mrac_step(board.mrac, params.law, board.r, readings.y, now.dt)), out
 
 
+def board_flow(params: Params, board: Board, readings: Readings) -> dict[str, Any]:
+    """Rates of what moves on board between ticks with continuous adaptation: r is held, u is not."""
+    mrac = mrac_flow(board.mrac, params.law, board.r, readings.y, params.a_m, params.b_m)
+    return dict(mrac=mrac, turns=readings.y)
+
+
+def board_flow_sampled(params: Params, board: Board, readings: Readings) -> dict[str, Any]:
+    """The same with sampled adaptation: r and u are held."""
+    y_m = params.b_m * board.r - params.a_m * board.mrac.y_m  # eq. (2)
+    return dict(mrac=Mrac(y_m, jnp.zeros_like(y_m), jnp.zeros_like(y_m)), turns=readings.y)
+
+
 def estimated(params: Params, now, board: Board, readings: Readings):
     """The estimate of a after eqs. (7)-(10), and whether it had to be kept from changing its sign."""
     old, rates = board.estimate, params.differenced > 0
@@ -304,28 +316,32 @@ def body_rate(scenario: Scenario, t, y):
 
 
 def flow(params: Params, scenario: Scenario, t, x: X, z: Z) -> X:
-    """dx/dt between ticks with continuous adaptation: r is held, u is not."""
+    """dx/dt between ticks with continuous adaptation; the wheel speed is read continuously."""
     x, moving = _moving(x, z)
-    y = tachometer(scenario, z.sensors.tacho, x.y)
-    mrac = mrac_flow(x.mrac, params.law, z.board.r, y, params.a_m, params.b_m)
-    return moving(_plant(scenario, t, x, z, mrac_input(x.mrac, z.board.r, y), mrac))
+    board, readings = _at(scenario, x, z)
+    u = mrac_input(board.mrac, board.r, readings.y)
+    return moving(X(*_plant(scenario, t, x, z, u), **board_flow(params, board, readings)))
 
 
 def flow_sampled(params: Params, scenario: Scenario, t, x: X, z: Z) -> X:
-    """dx/dt between ticks with sampled adaptation: r and u are held."""
+    """dx/dt between ticks with sampled adaptation: the command is held."""
     x, moving = _moving(x, z)
-    y_m = params.b_m * z.board.r - params.a_m * x.mrac.y_m  # eq. (2)
-    return moving(_plant(scenario, t, x, z, z.board.u, Mrac(y_m, jnp.zeros_like(y_m), jnp.zeros_like(y_m))))
+    board, readings = _at(scenario, x, z)
+    return moving(X(*_plant(scenario, t, x, z, board.u), **board_flow_sampled(params, board, readings)))
 
 
-def _plant(scenario: Scenario, t, x: X, z: Z, u, mrac: Mrac) -> X:
+def _at(scenario: Scenario, x: X, z: Z) -> tuple[Board, Readings]:
+    y = tachometer(scenario, z.sensors.tacho, x.y)
+    return z.board._replace(mrac=x.mrac, turns=x.turns), z.sensors.readings._replace(y=y)
+
+
+def _plant(scenario: Scenario, t, x: X, z: Z, u):
+    # rates of attitude and wheel speed
     wheel = scenario.wheel._replace(friction=z.friction)
     u = jnp.clip(u, -wheel.u_max, wheel.u_max)  # what the drive loses, it loses after its bound
-    return X(
-        theta=body_rate(scenario, t, x.y),
-        y=wheel_acceleration(wheel._replace(u_max=jnp.inf), x.y, read(z.drive, u)),  # eq. (3)
-        mrac=mrac,
-        turns=tachometer(scenario, z.sensors.tacho, x.y),
+    return (
+        body_rate(scenario, t, x.y),
+        wheel_acceleration(wheel._replace(u_max=jnp.inf), x.y, read(z.drive, u)),  # eq. (3)
     )
 
 
@@ -385,8 +401,9 @@ def normals_of(v, amplitude):
     return jnp.asarray(np.stack([normal, 0 * normal, 0 * normal], axis=1))
 
 
-def refuse_bad(params: Params, scenario: Scenario) -> None:
-    """The system's check: ValueError on input outside physics' domain."""
+def refuse_bad(params: Params, scenario: Scenario) -> tuple:
+    """The system's check: ValueError on input outside physics' domain; returns the lanes."""
+    lanes = check.shapes(params, scenario, Params(), Scenario())
     for name in ("duration", "K", "J_w", "J_hat", "a_m", "P0", "residual_max"):
         check.positive(f"params.{name}", getattr(params, name))
     for name in ("turn", "forward", "b_m", "a_r", "a_y", "blend"):
@@ -425,16 +442,18 @@ def refuse_bad(params: Params, scenario: Scenario) -> None:
     check.finite("scenario.torque", scenario.torque)
     for name in ("attitude", "tacho", "drive", "friction"):
         check_fault(f"scenario.{name}", getattr(scenario, name))
+    return lanes
 
 
-def _refuse_bad(sampled: bool, dt: float, substeps: int, params: Params, scenario: Scenario) -> None:
-    refuse_bad(params, scenario)
+def _refuse_bad(sampled: bool, dt: float, substeps: int, params: Params, scenario: Scenario) -> tuple:
+    lanes = refuse_bad(params, scenario)
     if check.concrete(scenario.delay):
         delay, longest = np.asarray(scenario.delay), DELAYS * dt
         inside = (delay >= 0) & (delay <= longest * (1 + 1e-9))
         check.each("scenario.delay", f"lie in 0 to {longest:g} s", delay, inside)
     if check.concrete((params, scenario)):
         _warn_of_fast_adaptation(sampled, dt, substeps, params, scenario)
+    return lanes
 
 
 def _warn_of_fast_adaptation(sampled: bool, dt: float, substeps: int, params: Params, scenario: Scenario) -> None:
