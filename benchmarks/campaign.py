@@ -8,7 +8,6 @@ import tempfile
 import time
 from pathlib import Path
 
-import jax
 import numpy as np
 
 from benchmarks import tiny_campaign as tiny
@@ -30,19 +29,15 @@ def rows(quick: bool):
 def kills(folder: Path, count: int, seed: int = 0):
     """Kill -9 a campaign at random moments, resume it, and compare all files with those of an uninterrupted one."""
     context, rng, n = tiny.processes(), np.random.default_rng(seed), BLOCKS * 128
-    process = context.Process(target=tiny.work, args=(folder / "whole.zarr", BLOCKS))
     started = time.perf_counter()
-    process.start()
-    while not (folder / "whole.zarr" / "done" / "c" / "0").exists():
-        time.sleep(0.001)
-    first = time.perf_counter() - started
-    process.join()
-    last = time.perf_counter() - started
+    tiny.killed(context, folder / "x.zarr", BLOCKS, BLOCKS, 0.0)
+    whole = time.perf_counter() - started
+    run(folder / "whole.zarr", tiny.campaign(), n, progress=False)
     expected, deaths, identical = tiny.files(folder / "whole.zarr"), [], 0
     for k in range(count):
-        path, warm = folder / f"{k}.zarr", k % 10 > 0  # one in ten at any moment of the start
-        moment = rng.uniform(0, 0.8 * (last - first) if warm else first)
-        deaths.append(tiny.killed(context, path, BLOCKS, moment, warm))
+        after = int(rng.integers(1, BLOCKS)) if k % 10 else 0  # one in ten dies at any moment of all
+        path, moment = folder / f"{k}.zarr", rng.uniform(0, 0.03 if after else whole)
+        deaths.append(tiny.killed(context, path, BLOCKS, after, moment))
         run(path, tiny.campaign(), n, progress=False)
         identical += tiny.files(path) == expected
     partial = sum(0 < death.blocks < BLOCKS for death in deaths)
@@ -73,10 +68,9 @@ def memory(folder: Path, few: int, many: int):
     yield dict(name="  the many over the few", value=peaks[many] / peaks[few], unit="1")
 
 
-def overhead(folder: Path, repeats: int, blocks: int = 4):
+def overhead(folder: Path, repeats: int, blocks: int = 4, size: int = 8192):
     """CPU time of campaigns over that of the bare sweep of the same scenarios, in blocks of at least a second."""
     base = campaign("observer_pd", 1)
-    size = 16 * 1024 * len(jax.local_devices())
     base, n = base._replace(block=size), blocks * size
     many = scenarios(base, 0, n)
 

@@ -107,11 +107,11 @@ def processes():
     return context
 
 
-def killed(context, path: Path, blocks: int, moment: float, warm: bool = True, **change) -> Death:
-    """Start a campaign, kill -9 it ``moment`` seconds after its first block (warm) or after its start."""
+def killed(context, path: Path, blocks: int, after: int, moment: float, **change) -> Death:
+    """Start a campaign and kill -9 it ``moment`` seconds after so many of its blocks are done."""
     process = context.Process(target=work, args=(path, blocks), kwargs=change)
     process.start()
-    while warm and process.is_alive() and not (path / "done" / "c" / "0").exists():
+    while after and process.is_alive() and not (path / "done" / "c" / str(after - 1)).exists():
         time.sleep(0.001)
     time.sleep(moment)
     process.kill()

@@ -150,7 +150,7 @@ def scenario_star(d):
 
 def draw_wheel(u):
     return dict(
-        J_hat=between(u[0], 4, 7), K=between_logs(u[1], 0.5, 5), gamma=between_logs(u[2], 1e-8, 3e-6),
+        believed_J=between(u[0], 4, 7), K=between_logs(u[1], 0.5, 5), gamma=between_logs(u[2], 1e-8, 3e-6),
         estimating=one_of(u[3], 2), J_z=between(u[4], 4, 7), noise=between(u[5], 0, 0.1),
         friction=between(u[6], 0, 3e4), onset=between(u[7], 12, 80), effectiveness=between(u[8], 0.05, 1),
     )  # fmt: skip
@@ -158,14 +158,15 @@ def draw_wheel(u):
 
 def scenario_wheel(d):
     law = wm.params.law._replace(gamma=d["gamma"])
-    params = wm.params._replace(J_hat=d["J_hat"], K=d["K"], law=law, a_r=0.5, a_y=0.0, ope=d["estimating"])
+    params = wm.params._replace(J_hat=d["believed_J"], K=d["K"], law=law, a_r=0.5, a_y=0.0, ope=d["estimating"])
     drive = wm.scenario.drive._replace(onset=d["onset"], scale=d["effectiveness"])
     wheel = wm.scenario.wheel._replace(friction=d["friction"])
     return params, wm.scenario._replace(J_z=d["J_z"], noise=d["noise"], wheel=wheel, drive=drive)
 
 
 def score_wheel(_, pair, now, log):
-    return wm.score(*pair, now, log)
+    params, scenario = pair
+    return wm.score(params, scenario, now, log)
 
 
 RATE, SECONDS = "rad/s", "s"
@@ -197,7 +198,7 @@ PLANS = {
     ),
     "wheel_mrac": Plan(
         varied(wm.loop(substeps=8)), (), score_wheel, 4501, 9, draw_wheel, scenario_wheel,
-        dict(J_z="kg m^2", gamma="1", noise="deg", friction="deg/s^2", onset=SECONDS, peak="deg", rms="deg",
+        dict(J_z="kg m^2", believed_J="kg m^2", gamma="1", noise="deg", friction="deg/s^2", onset=SECONDS, peak="deg", rms="deg",
              peak_ill="deg", delay=SECONDS, settling_ill=SECONDS, J_settling=SECONDS, chatter="deg/s"),
         lambda log: dict(error=log.error),
     ),

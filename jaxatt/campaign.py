@@ -8,17 +8,14 @@ else is computed again. A store holds numbers and names, no code: opening one ru
 
 from __future__ import annotations
 
-import fcntl
 import os
 import pickle
 import platform
-import shutil
 import subprocess
 import warnings
 import zlib
 from collections.abc import Callable, Collection, Iterator, Mapping
 from concurrent.futures import Executor, as_completed
-from contextlib import contextmanager
 from functools import lru_cache, partial
 from pathlib import Path
 from types import MappingProxyType
@@ -26,25 +23,36 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import jaxlib
 import numpy as np
 
 from jaxatt import check
-from jaxatt.engine import BLOCK, System, block_records, block_scores, compiled, raw_key
+from jaxatt.engine import BLOCK, System, block_records, block_scores, compiled, one_key
+from jaxatt.store import (
+    OWN,
+    Store,
+    Variable,
+    blocks_of,
+    create,
+    lock_file,
+    metadata_lock,
+    open_store,
+    read_block,
+    sized,
+    state_of,
+    sweep_up,
+    take,
+    write_block,
+)
 from jaxatt.study import _bar, _lanes_of, logged, scored
 from jaxatt.summary import Rate, narrowed
 
 try:
     import xarray as xr
     import zarr
-    from zarr.codecs import Crc32cCodec, ZstdCodec
 except ImportError as error:
     raise ImportError(
         f"jaxatt.campaign needs the extra `campaign`: pip install 'jaxatt[campaign]' ({error})."
     ) from None
-
-STATUS = ("good", "failed", "refused")  # of a scenario: its score `ok` held; it did not; the system's check refused it
-OWN = "done"  # the array of checksums
 
 
 class Campaign(NamedTuple):
@@ -149,15 +157,6 @@ def _named(tree, alone: str) -> dict:
     return {jax.tree_util.keystr(path, simple=True, separator=".") or alone: leaf for path, leaf in leaves}
 
 
-class Variable(NamedTuple):
-    """An array of the store."""
-
-    role: str  # score, input, record or status
-    dims: tuple  # names of the axes; the last is "scenario"
-    shape: tuple  # all axes but the last
-    dtype: Any  # `numpy.dtype`
-
-
 def _variables(campaign: Campaign) -> dict[str, Variable]:
     """The arrays of the store by name; draws the first scenarios and traces the loop.
 
@@ -181,7 +180,8 @@ def _variables(campaign: Campaign) -> dict[str, Variable]:
             check.refuse(f"{role}.{name}", "have a name of its own among scores, inputs and records", repr(name))
         inner = a.shape[1:-1] if role == "record" else a.shape[:-1]
         dims = ("time",) * (role == "record") + tuple(f"{name}_{axis}" for axis in range(len(inner)))
-        variables[name] = Variable(role, (*dims, "scenario"), a.shape[:-1], np.dtype(a.dtype))
+        unit = campaign.units.get(name, "")
+        variables[name] = Variable(role, (*dims, "scenario"), a.shape[:-1], np.dtype(a.dtype), unit)
     for name in campaign.units:
         if name not in variables:
             check.refuse("campaign.units", f"name scores, inputs or records ({', '.join(variables)})", repr(name))
@@ -193,6 +193,8 @@ def _variables(campaign: Campaign) -> dict[str, Variable]:
 
 def _admitted(campaign: Campaign) -> Campaign:
     """The campaign with plain NumPy leaves, checked."""
+    for name in ("sample", "score"):
+        check.function(f"campaign.{name}", getattr(campaign, name))
     check.whole("campaign.ticks", campaign.ticks)
     check.whole("campaign.every", campaign.every)
     if check.whole("campaign.block", campaign.block) % BLOCK:
@@ -200,7 +202,7 @@ def _admitted(campaign: Campaign) -> Campaign:
     if campaign.size is not None:
         check.whole("campaign.size", campaign.size)
     params, _ = check.converted(campaign.params, ())
-    return campaign._replace(params=jax.tree.map(np.asarray, params), key=np.asarray(raw_key(campaign.key)))
+    return campaign._replace(params=jax.tree.map(np.asarray, params), key=np.asarray(one_key(campaign.key)))
 
 
 def _name(thing) -> str:
@@ -235,11 +237,11 @@ def _environment() -> dict:
     flags = [f for f in os.environ.get("XLA_FLAGS", "").split() if "host_platform_device_count" not in f]
     return {
         "jax": jax.__version__,
-        "jaxlib": jaxlib.__version__,
+        "jaxlib": jax.lib.__version__,
         "backend": jax.default_backend(),
         "device": jax.devices()[0].device_kind,
         "machine": platform.machine(),
-        "x64": bool(jax.config.jax_enable_x64),
+        "x64": bool(jax.config.read("jax_enable_x64")),
         "XLA_FLAGS": " ".join(sorted(flags)),
     }
 
@@ -282,173 +284,6 @@ def _refuse_other(path: Path, stored: Mapping, now: Mapping, accept: Collection[
         raise ValueError(f"`campaign` must be the one that began {path.name}, but these differ: {each}.")
 
 
-# the store
-
-
-_WHOLE = {"array.write_empty_chunks": True}  # a missing file shall mean a missing block; read as arrays are opened
-
-
-class Store(NamedTuple):
-    """An open store."""
-
-    path: Path
-    group: Any  # `zarr.Group`
-    arrays: dict  # of Zarr arrays by name, `OWN` too
-    manifest: dict
-
-    def span(self, block: int) -> tuple[int, int]:
-        """First scenario of a block and the one after its last."""
-        size = self.manifest["block"]
-        return block * size, min((block + 1) * size, self.manifest["n"])
-
-
-def _blocks(n: int, block: int) -> int:
-    return -(-n // block)
-
-
-def _created(path: Path, campaign: Campaign, n: int) -> None:
-    """Make an empty store, beside its place first, so that it is there as a whole or not at all."""
-    variables, manifest = _variables(campaign), _manifest(campaign, n)
-    new = path.with_name(path.name + ".new")
-    shutil.rmtree(new, ignore_errors=True)  # of a run that was killed just here
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with zarr.config.set(_WHOLE):
-        group = zarr.create_group(new, zarr_format=3, attributes={"campaign": manifest, "variables": list(variables)})
-        codecs: list = [ZstdCodec(level=1), Crc32cCodec()]
-        for name, v in variables.items():
-            flags = {"flag_values": [0, 1, 2], "flag_meanings": " ".join(STATUS)} if v.role == "status" else {}
-            unit = {"units": campaign.units[name]} if name in campaign.units else {}
-            nothing: Any = {"f": np.nan, "i": -1}.get(v.dtype.kind, 0)
-            group.create_array(
-                name, shape=(*v.shape, n), chunks=(*(max(a, 1) for a in v.shape), campaign.block), dtype=v.dtype,
-                compressors=codecs, fill_value=nothing, dimension_names=v.dims, attributes={"role": v.role, **flags, **unit},
-            )  # fmt: skip
-        group.create_array(
-            OWN, shape=(_blocks(n, campaign.block),), chunks=(1,), dtype=np.uint64, fill_value=0, compressors=codecs,
-            dimension_names=("block",), attributes={"role": "checksum", "long_name": "2^32 + crc32 of a block"},
-        )  # fmt: skip
-        if campaign.record is not None:
-            times = np.arange(0, campaign.ticks, campaign.every) * campaign.system.dt
-            array = group.create_array(
-                "time", shape=times.shape, dtype=times.dtype, dimension_names=("time",),
-                attributes={"role": "time", "units": "s"},
-            )  # fmt: skip
-            array[:] = times
-    os.rename(new, path)
-
-
-def _opened(path: Path, mode: Any = "r") -> Store:
-    """The store at path. Raises FileNotFoundError if there is none, ValueError if it is no campaign."""
-    if not path.exists():
-        raise FileNotFoundError(f"`path` must be the store of a campaign, but there is nothing at {path}.")
-    try:
-        with zarr.config.set(_WHOLE):
-            group = zarr.open_group(path, mode=mode, zarr_format=3)
-            arrays = {name: array for name, array in group.arrays() if name != "time"}
-        manifest: Any = group.attrs["campaign"]
-    except (KeyError, FileNotFoundError, ValueError, TypeError) as error:
-        raise ValueError(f"`path` must be the store of a campaign, but {path} is not: {error}.") from error
-    return Store(path, group, arrays, dict(manifest))
-
-
-def _sized(store: Store, n: int) -> Store:
-    """The store for n scenarios. The manifest speaks last: a run killed in between is made good by the next."""
-    last, block = store.manifest["n"], store.manifest["block"]
-    wanted = {name: n for name in store.arrays} | {OWN: _blocks(n, block)}
-    if n != last and last % block:
-        store.arrays[OWN][last // block] = 0  # the last block was not full and has to grow
-    for name, array in store.arrays.items():
-        if array.shape[-1] != wanted[name]:
-            array.resize((*array.shape[:-1], wanted[name]))
-    if n != last:
-        store.group.attrs["campaign"] = {**store.manifest, "n": n}
-    return _opened(store.path, "r+")
-
-
-def _read(store: Store, block: int) -> dict[str, np.ndarray]:
-    start, stop = store.span(block)
-    return {name: np.asarray(a[..., start:stop]) for name, a in store.arrays.items() if name != OWN}
-
-
-def _write(store: Store, block: int, values: dict[str, np.ndarray]) -> None:
-    """Write a block; its checksum comes last and makes it one."""
-    start, stop = store.span(block)
-    for name, a in values.items():
-        store.arrays[name][..., start:stop] = a
-    store.arrays[OWN][block] = _checksum(values)
-
-
-def _checksum(values: dict[str, np.ndarray]) -> np.uint64:
-    crc = 0
-    for name in sorted(values):
-        a = np.ascontiguousarray(values[name])
-        crc = zlib.crc32(a.tobytes(), zlib.crc32(f"{name} {a.dtype} {a.shape}".encode(), crc))
-    return np.uint64(2**32 + crc)  # never 0, which is "not done"
-
-
-def _state(store: Store, block: int) -> str:
-    """done, missing or damaged: what is there does not fit its checksum, or cannot be read."""
-    try:
-        mark = store.arrays[OWN][block]
-        if mark == 0:
-            return "missing"
-        return "done" if mark == _checksum(_read(store, block)) else "damaged"
-    except OSError:
-        raise
-    except Exception:  # whatever a codec says of a broken chunk
-        return "damaged"
-
-
-# one writer for a block
-
-
-_held: set[Path] = set()  # POSIX locks do not keep a process from itself
-
-
-@contextmanager
-def _lock_file(path: Path):
-    """The open lock file beside a store: its byte 0 stands for the metadata, byte 1 + b for block b.
-
-    The system drops the locks of a process that dies, however it dies, so none is ever stale.
-    """
-    file = path.with_name(path.name + ".lock").resolve()
-    if file in _held:
-        raise RuntimeError(f"`path` must have one writer, but this process is writing to {path} already.")
-    file.parent.mkdir(parents=True, exist_ok=True)
-    _held.add(file)
-    handle = os.open(file, os.O_RDWR | os.O_CREAT, 0o644)
-    try:
-        yield handle
-    finally:
-        os.close(handle)
-        _held.discard(file)
-
-
-@contextmanager
-def _metadata(handle: int):
-    fcntl.lockf(handle, fcntl.LOCK_EX, 1, 0)  # waits: creating and growing a store take a moment
-    yield
-    fcntl.lockf(handle, fcntl.LOCK_UN, 1, 0)
-
-
-def _take(handle: int, path: Path, mine: range) -> None:
-    try:
-        fcntl.lockf(handle, fcntl.LOCK_EX | fcntl.LOCK_NB, len(mine), 1 + mine.start)
-    except OSError:
-        raise RuntimeError(
-            f"`path` must have one writer for a block, but another process is writing to {path}, "
-            f"blocks {mine.start} to {mine.stop - 1} or some of them."
-        ) from None
-
-
-def _sweep_up(store: Store, mine: range) -> None:
-    """Remove what a killed write left of my blocks; the last number in a chunk's name is its block."""
-    for file in store.path.rglob("*.partial"):
-        head = file.name.split(".")[0]
-        if head.isdigit() and int(head) in mine:
-            file.unlink(missing_ok=True)
-
-
 # running
 
 
@@ -483,7 +318,7 @@ def extend(path, campaign: Campaign, n: int, **how) -> xr.Dataset:
     does and has a `size` for that. Raises what `run` raises, FileNotFoundError where there is no store, and
     ValueError if n is less than there is.
     """
-    _opened(Path(path))
+    open_store(Path(path))
     return _run(
         Path(path), campaign, n, True, **{"shard": (0, 1), "executor": None, "accept": (), "progress": None, **how}
     )
@@ -496,14 +331,14 @@ def _run(path: Path, campaign: Campaign, n: int, grow: bool, shard, executor, ac
         check.refuse("shard", "be (k, m) with k < m", shard)
     if campaign.size is not None and n > campaign.size:
         check.refuse("n", f"not exceed the {campaign.size} points of the design", n)
-    with _lock_file(path) as handle:
-        with _metadata(handle):
+    with lock_file(path) as handle:
+        with metadata_lock(handle):
             store = _prepared(path, campaign, n, grow, accept)
-        count = _blocks(n, campaign.block)
+        count = blocks_of(n, campaign.block)
         mine = range(k * count // m, (k + 1) * count // m)
         if len(mine):
-            _take(handle, path, mine)
-            _sweep_up(store, mine)
+            take(handle, path, mine)
+            sweep_up(store, mine)
             _complete(store, campaign, mine, executor, accept, progress)
     return dataset(path)
 
@@ -511,19 +346,21 @@ def _run(path: Path, campaign: Campaign, n: int, grow: bool, shard, executor, ac
 def _prepared(path: Path, campaign: Campaign, n: int, grow: bool, accept) -> Store:
     """The store, created if there is none, for n scenarios."""
     if not path.exists():
-        _created(path, campaign, n)
-        return _opened(path, "r+")
-    store = _opened(path, "r+")
+        records = np.arange(0, campaign.ticks, campaign.every) * campaign.system.dt
+        variables = _variables(campaign)
+        create(path, variables, _manifest(campaign, n), None if campaign.record is None else records)
+        return open_store(path, "r+")
+    store = open_store(path, "r+")
     _refuse_other(path, store.manifest, _manifest(campaign, n), accept)
     stored = store.manifest["n"]
     if n < stored or (n > stored and not grow):
         check.refuse("n", f"be the {stored} scenarios of the store (or more, in `extend`)", n)
-    return _sized(store, n)
+    return sized(store, n)
 
 
 def _complete(store: Store, campaign: Campaign, mine: range, executor: Executor | None, accept, progress) -> None:
     """Compute and write those of my blocks that are not done."""
-    states = {block: _state(store, block) for block in mine}
+    states = {block: state_of(store, block) for block in mine}
     damaged = [block for block, state in states.items() if state == "damaged"]
     if damaged:
         warnings.warn(f"{store.path.name}: blocks {damaged} are damaged and computed again.", stacklevel=4)
@@ -537,14 +374,14 @@ def _complete(store: Store, campaign: Campaign, mine: range, executor: Executor 
             compute = lambda spans: _here(campaign, spans, bar.update)
         else:
             compute = lambda spans: _elsewhere(campaign, spans, executor, bar.update)
-        known = next((b for b in (*done, *range(store.arrays[OWN].shape[0])) if _state(store, b) == "done"), None)
+        known = next((b for b in (*done, *range(store.arrays[OWN].shape[0])) if state_of(store, b) == "done"), None)
         if known is not None and not accept:
             _try(store, known, compute)
         spans = {store.span(block): block for block in missing}
         for span, values in compute(list(spans)):
             if {*values, OWN} != {*store.arrays}:
                 check.refuse("campaign", f"give what the store holds, {sorted(store.arrays)}", sorted({*values, OWN}))
-            _write(store, spans[span], values)
+            write_block(store, spans[span], values)
 
 
 def _try(store: Store, block: int, compute: Callable) -> None:
@@ -552,7 +389,7 @@ def _try(store: Store, block: int, compute: Callable) -> None:
     start, stop = store.span(block)
     span = start, min(start + BLOCK, stop)
     [(_, again)] = compute([span])
-    there = {name: a[..., : span[1] - start] for name, a in _read(store, block).items()}
+    there = {name: a[..., : span[1] - start] for name, a in read_block(store, block).items()}
     other = [name for name in there if name not in again or again[name].tobytes() != there[name].tobytes()]
     if other:
         raise ValueError(
@@ -562,8 +399,8 @@ def _try(store: Store, block: int, compute: Callable) -> None:
 
 
 def _here(campaign: Campaign, spans, advance: Callable) -> Iterator:
-    for span in spans:
-        yield span, results(campaign, *span, advance)
+    for start, stop in spans:
+        yield (start, stop), results(campaign, start, stop, advance)
 
 
 def _elsewhere(campaign: Campaign, spans, executor: Executor, advance: Callable) -> Iterator:
@@ -617,11 +454,11 @@ def dataset(path) -> xr.Dataset:
 
     Raises RuntimeError if blocks are damaged or the store was left while it grew: run the campaign again.
     """
-    store = _opened(Path(path))
+    store = open_store(Path(path))
     n = store.manifest["n"]
     if any(a.shape[-1] != n for name, a in store.arrays.items() if name != OWN):
         raise RuntimeError(f"{store.path} was left while it grew: run or extend the campaign again.")
-    states = [_state(store, block) for block in range(_blocks(n, store.manifest["block"]))]
+    states = [state_of(store, block) for block in range(blocks_of(n, store.manifest["block"]))]
     damaged = [block for block, state in enumerate(states) if state == "damaged"]
     if damaged:
         raise RuntimeError(f"{store.path}: blocks {damaged} are damaged: run the campaign again to repair them.")
@@ -638,7 +475,7 @@ def replay(path, campaign: Campaign, index: int):
 
     Raises ValueError if the campaign is not the one of the store, or the index is none of its scenarios.
     """
-    campaign, store = _admitted(campaign), _opened(Path(path))
+    campaign, store = _admitted(campaign), open_store(Path(path))
     n = store.manifest["n"]
     _refuse_other(store.path, store.manifest, _manifest(campaign, n))
     if check.whole("index", index, 0) >= n:
@@ -669,7 +506,7 @@ def until(path, campaign: Campaign, looks, success: Callable, half_width: float,
 
     def counts():
         for n in looks:
-            stored = _opened(path).manifest["n"] if path.exists() else n
+            stored = open_store(path).manifest["n"] if path.exists() else n
             done = (extend if n > stored else run)(path, campaign, max(n, stored), **how)
             yield int(np.sum(success(done.isel(scenario=slice(n)))))
 

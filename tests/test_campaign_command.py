@@ -8,6 +8,7 @@ from experiments.__main__ import NAMES
 from jaxatt import campaign as module
 from jaxatt import check
 from jaxatt.campaign import dataset
+from jaxatt.systems import cmg_loss, gyro_ekf, observer_pd, star_isolation, wheel_mrac
 
 
 @pytest.fixture
@@ -21,7 +22,7 @@ def plan(monkeypatch):
 
 def test_the_command_runs_stops_on_interrupt_and_goes_on(plan, tmp_path, monkeypatch, capsys):
     words = ["--n", "1024", "--block", "128", "--out", str(tmp_path / "x")]
-    write, blocks = module._write, []
+    write, blocks = module.write_block, []
 
     def interrupted(*args):
         write(*args)
@@ -29,9 +30,9 @@ def test_the_command_runs_stops_on_interrupt_and_goes_on(plan, tmp_path, monkeyp
         if len(blocks) == 3:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(module, "_write", interrupted)
+    monkeypatch.setattr(module, "write_block", interrupted)
     assert campaigns.main("tiny", words) == 130
-    monkeypatch.setattr(module, "_write", write)
+    monkeypatch.setattr(module, "write_block", write)
     told = capsys.readouterr().err
     assert "every block written is kept. To go on: python -m experiments tiny campaign --n 1024" in told
     assert told.rstrip().endswith("--resume") and "scenarios/s" in told
@@ -73,6 +74,12 @@ def test_bad_words_are_refused(tmp_path, capsys):
         assert refused.value.code == 2 and message in capsys.readouterr().err
 
 
+SCORES = {
+    "observer_pd": observer_pd.Scores, "gyro_ekf": gyro_ekf.FilterScores, "cmg_loss": cmg_loss.Scores,
+    "star_isolation": star_isolation.Scores, "wheel_mrac": wheel_mrac.Scores,
+}  # fmt: skip
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_every_experiment_draws_scenarios_that_its_door_lets_in(name):
     this = module._admitted(campaigns.campaign(name, 128))
@@ -80,5 +87,7 @@ def test_every_experiment_draws_scenarios_that_its_door_lets_in(name):
     params, scenarios = check.converted(this.params, scenarios)
     this.system.check(params, scenarios)
     assert check.lanes(scenarios) == 128
+    fields = set(SCORES[name]._fields)
+    assert not fields & set(inputs) and set(this.units) <= fields | set(inputs)
     for values in jax.tree.leaves(inputs):
         assert np.isfinite(values).all() and (np.ptp(values, axis=-1) > 0).all()

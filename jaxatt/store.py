@@ -1,0 +1,213 @@
+"""The store of a campaign: a Zarr group of labelled arrays in chunks of one block, and who may write to it.
+
+Every chunk is written whole and carries a checksum; the chunk of a block in ``done``, written last, holds that of
+all its numbers. A block whose numbers do not fit it is not done. Knows no campaign but its manifest.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import shutil
+import zlib
+from collections.abc import Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+try:
+    import zarr
+    from zarr.codecs import Crc32cCodec, ZstdCodec
+except ImportError as error:
+    raise ImportError(
+        f"jaxatt.campaign needs the extra `campaign`: pip install 'jaxatt[campaign]' ({error})."
+    ) from None
+
+STATUS = ("good", "failed", "refused")  # of a scenario: its score `ok` held; it did not; the system's check refused it
+OWN = "done"  # the array of checksums
+_WHOLE = {"array.write_empty_chunks": True}  # a missing file shall mean a missing block; read as arrays are opened
+
+
+class Variable(NamedTuple):
+    """An array of the store."""
+
+    role: str  # score, input, record or status
+    dims: tuple  # names of the axes; the last is "scenario"
+    shape: tuple  # all axes but the last
+    dtype: Any  # `numpy.dtype`
+    units: str = ""  # "" where none are given
+
+
+class Store(NamedTuple):
+    """An open store."""
+
+    path: Path
+    group: Any  # `zarr.Group`
+    arrays: dict  # of Zarr arrays by name, `OWN` too
+    manifest: dict
+
+    def span(self, block: int) -> tuple[int, int]:
+        """First scenario of a block and the one after its last."""
+        size = self.manifest["block"]
+        return block * size, min((block + 1) * size, self.manifest["n"])
+
+
+def blocks_of(n: int, block: int) -> int:
+    """How many blocks n scenarios make."""
+    return -(-n // block)
+
+
+def create(path: Path, variables: Mapping[str, Variable], manifest: Mapping, times: np.ndarray | None) -> None:
+    """Make an empty store, beside its place first, so that it is there as a whole or not at all.
+
+    manifest: plain values for JSON, ``n`` and ``block`` [scenarios] among them; times [s]: of the records, if any.
+    """
+    n, block = manifest["n"], manifest["block"]
+    new = path.with_name(path.name + ".new")
+    shutil.rmtree(new, ignore_errors=True)  # of a run that was killed just here
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with zarr.config.set(_WHOLE):
+        group = zarr.create_group(
+            new, zarr_format=3, attributes={"campaign": dict(manifest), "variables": list(variables)}
+        )
+        codecs: list = [ZstdCodec(level=1), Crc32cCodec()]
+        for name, v in variables.items():
+            flags = {"flag_values": [0, 1, 2], "flag_meanings": " ".join(STATUS)} if v.role == "status" else {}
+            unit = {"units": v.units} if v.units else {}
+            nothing: Any = {"f": np.nan, "i": -1}.get(v.dtype.kind, 0)
+            group.create_array(
+                name, shape=(*v.shape, n), chunks=(*(max(a, 1) for a in v.shape), block), dtype=v.dtype,
+                compressors=codecs, fill_value=nothing, dimension_names=v.dims, attributes={"role": v.role, **flags, **unit},
+            )  # fmt: skip
+        group.create_array(
+            OWN, shape=(blocks_of(n, block),), chunks=(1,), dtype=np.uint64, fill_value=0, compressors=codecs,
+            dimension_names=("block",), attributes={"role": "checksum", "long_name": "2^32 + crc32 of a block"},
+        )  # fmt: skip
+        if times is not None:
+            array = group.create_array(
+                "time", shape=times.shape, dtype=times.dtype, dimension_names=("time",),
+                attributes={"role": "time", "units": "s"},
+            )  # fmt: skip
+            array[:] = times
+    os.rename(new, path)
+
+
+def open_store(path: Path, mode: Any = "r") -> Store:
+    """The store at path; mode "r" reads, "r+" writes.
+
+    Raises FileNotFoundError if there is none, ValueError if it is no campaign.
+    """
+    if not path.exists():
+        raise FileNotFoundError(f"`path` must be the store of a campaign, but there is nothing at {path}.")
+    try:
+        with zarr.config.set(_WHOLE):
+            group = zarr.open_group(path, mode=mode, zarr_format=3)
+            arrays = {name: array for name, array in group.arrays() if name != "time"}
+        manifest: Any = group.attrs["campaign"]
+    except (KeyError, FileNotFoundError, ValueError, TypeError) as error:
+        raise ValueError(f"`path` must be the store of a campaign, but {path} is not: {error}.") from error
+    return Store(path, group, arrays, dict(manifest))
+
+
+def sized(store: Store, n: int) -> Store:
+    """The store for n scenarios. The manifest speaks last: a run killed in between is made good by the next."""
+    last, block = store.manifest["n"], store.manifest["block"]
+    wanted = {name: n for name in store.arrays} | {OWN: blocks_of(n, block)}
+    if n != last and last % block:
+        store.arrays[OWN][last // block] = 0  # the last block was not full and has to grow
+    for name, array in store.arrays.items():
+        if array.shape[-1] != wanted[name]:
+            array.resize((*array.shape[:-1], wanted[name]))
+    if n != last:
+        store.group.attrs["campaign"] = {**store.manifest, "n": n}
+    return open_store(store.path, "r+")
+
+
+def read_block(store: Store, block: int) -> dict[str, np.ndarray]:
+    """The numbers of a block, by name; whatever the codecs raise where a chunk is broken."""
+    start, stop = store.span(block)
+    return {name: np.asarray(a[..., start:stop]) for name, a in store.arrays.items() if name != OWN}
+
+
+def write_block(store: Store, block: int, values: dict[str, np.ndarray]) -> None:
+    """Write a block; its checksum comes last and makes it one."""
+    start, stop = store.span(block)
+    for name, a in values.items():
+        store.arrays[name][..., start:stop] = a
+    store.arrays[OWN][block] = checksum_of(values)
+
+
+def checksum_of(values: dict[str, np.ndarray]) -> np.uint64:
+    """2^32 + crc32 of the names, types, shapes and numbers of a block: never 0, which is "not done"."""
+    crc = 0
+    for name in sorted(values):
+        a = np.ascontiguousarray(values[name])
+        crc = zlib.crc32(a.tobytes(), zlib.crc32(f"{name} {a.dtype} {a.shape}".encode(), crc))
+    return np.uint64(2**32 + crc)
+
+
+def state_of(store: Store, block: int) -> str:
+    """done, missing or damaged: what is there does not fit its checksum, or cannot be read."""
+    try:
+        mark = store.arrays[OWN][block]
+        if mark == 0:
+            return "missing"
+        return "done" if mark == checksum_of(read_block(store, block)) else "damaged"
+    except OSError:
+        raise
+    except Exception:  # whatever a codec says of a broken chunk
+        return "damaged"
+
+
+# one writer for a block
+
+
+_held: set[Path] = set()  # POSIX locks do not keep a process from itself
+
+
+@contextmanager
+def lock_file(path: Path):
+    """The open lock file beside a store: its byte 0 stands for the metadata, byte 1 + b for block b.
+
+    The system drops the locks of a process that dies, however it dies, so none is ever stale.
+    """
+    file = path.with_name(path.name + ".lock").resolve()
+    if file in _held:
+        raise RuntimeError(f"`path` must have one writer, but this process is writing to {path} already.")
+    file.parent.mkdir(parents=True, exist_ok=True)
+    _held.add(file)
+    handle = os.open(file, os.O_RDWR | os.O_CREAT, 0o644)
+    try:
+        yield handle
+    finally:
+        os.close(handle)
+        _held.discard(file)
+
+
+@contextmanager
+def metadata_lock(handle: int):
+    """Alone with the metadata of the store."""
+    fcntl.lockf(handle, fcntl.LOCK_EX, 1, 0)  # waits: creating and growing a store take a moment
+    yield
+    fcntl.lockf(handle, fcntl.LOCK_UN, 1, 0)
+
+
+def take(handle: int, path: Path, mine: range) -> None:
+    """Lock my blocks until ``handle``, of the lock file, is closed. Raises RuntimeError if another process has some."""
+    try:
+        fcntl.lockf(handle, fcntl.LOCK_EX | fcntl.LOCK_NB, len(mine), 1 + mine.start)
+    except OSError:
+        raise RuntimeError(
+            f"`path` must have one writer for a block, but another process is writing to {path}, "
+            f"blocks {mine.start} to {mine.stop - 1} or some of them."
+        ) from None
+
+
+def sweep_up(store: Store, mine: range) -> None:
+    """Remove what a killed write left of my blocks; the last number in a chunk's name is its block."""
+    for file in store.path.rglob("*.partial"):
+        head = file.name.split(".")[0]
+        if head.isdigit() and int(head) in mine:
+            file.unlink(missing_ok=True)
