@@ -138,7 +138,7 @@ def function(name: str, value) -> None:
 
 
 def fits_memory(name: str, takes: int, way_out: str) -> None:
-    """Refuse a result of so many bytes if they are not free; name: of what it holds, way_out: what to do instead."""
+    """Refuse a result that takes more bytes than are free; name: of what it holds, way_out: what to do instead."""
     free = free_memory()
     if takes > free:
         raise ValueError(f"{name} takes {takes / 1e9:.3g} GB, but {free / 1e9:.3g} GB of memory are free: {way_out}.")
@@ -207,7 +207,10 @@ def kind(name: str, value, wanted: type) -> None:
 
 
 def shapes(params, scenario, params_like, scenario_like) -> tuple:
-    """The lanes of a scenario: `lanes_of` both, where params carry none or, in a design study, the scenario's."""
+    """The lanes of a scenario: `lanes_of` both, where params carry none or, in a design study, the scenario's.
+
+    params_like, scenario_like: examples of both.
+    """
     lanes, its = lanes_of("scenario", scenario, scenario_like), lanes_of("params", params, params_like)
     if its not in ((), lanes):
         refuse("params", f"carry no lanes, or the scenario's, {lanes}", its)

@@ -175,7 +175,7 @@ def chance(false_alarm, samples):
 
 @door
 def interval(successes: int, trials: int, z: float = 1.959964) -> tuple[float, float]:
-    """Wilson's interval of a share, successes of so many trials, 95 % by default; z: standard deviations a side."""
+    """Wilson's confidence interval of successes in trials, 95 % by default; z: standard deviations on either side."""
     p, n = successes / trials, trials
     centre = (p + z * z / (2 * n)) / (1 + z * z / n)
     half = z / (1 + z * z / n) * float(np.sqrt(p * (1 - p) / n + z * z / (4 * n * n)))

@@ -114,10 +114,10 @@ def settling(now, outside, inside: Any = True) -> SoftSettling:
 class Chatter(NamedTuple):
     """Root mean square change from tick to tick in a window; NaN if it held fewer than two ticks."""
 
-    total: Any = 0.0  # sum of squares of the changes
-    ticks: Any = 0.0
-    first: Any = 0.0
-    last: Any = 0.0
+    total: Any = 0.0  # (*lanes) sum of squares of the changes
+    ticks: Any = 0.0  # (*lanes) number of ticks in it
+    first: Any = 0.0  # (*lanes)
+    last: Any = 0.0  # (*lanes)
 
     def __add__(self, later):
         jump = jnp.where((self.ticks > 0) & (later.ticks > 0), later.first - self.last, 0)
@@ -134,7 +134,7 @@ class Chatter(NamedTuple):
 
 
 def chatter(value, inside: Any = True) -> Chatter:
-    """Tally how much a command jumps from tick to tick, over the ticks of one window: the wear of an actuator."""
+    """Tally how much ``value``, a command, jumps from tick to tick in one window: the wear of an actuator."""
     value = jnp.asarray(value, jnp.result_type(value, 1.0))
     there = jnp.broadcast_to(jnp.asarray(inside, value.dtype), value.shape)
     kept = jnp.where(there > 0, value, 0)

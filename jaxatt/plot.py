@@ -149,8 +149,8 @@ def heat_map(
 ) -> Axes:
     """Mean of a score over two quantities of the scenarios, such as the share of faults detected; empty cells blank.
 
-    data: columns of shape (n,); x, y and value name three of them. bins: cells along each axis. log: which of x and y run
-    over decades. chance: the level that a detector reaches by luck, marked on the colour bar.
+    data: columns of shape (n,), of which x, y and value are named. bins: cells along each axis. log: which of
+    x and y run over decades. chance: the level that a detector reaches by luck, marked on the colour bar.
 
     Raises ValueError for an unknown name, a label without unit and values <= 0 on a logarithmic axis.
     """
@@ -250,7 +250,7 @@ def front(costs) -> np.ndarray:
 
 
 def pareto(data, x: str, y: str, *, marked: Mapping[str, int] | None = None, labels=None, ax=None) -> Axes:
-    """Designs by two costs, both to be small, with the front of those that no other one beats.
+    """Designs by two costs, x and y, both to be small, with the front of those that no other one beats.
 
     data: columns of shape (n,); x and y name two of them. marked: names of designs, by their number, such as ``{"paper": 0}``.
     """

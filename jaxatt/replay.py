@@ -121,9 +121,8 @@ def _replay(decide, flow, dt, substeps, params, board, readings, between):
 def load(path, units: Mapping[str, str], *, time: str = "time") -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Times (T,) [s] and channels (T,) of a ``.csv`` or ``.parquet`` file whose columns are named "gyro_a [rad/s]".
 
-    units: the unit that each channel must have, by name; other columns are left alone. time: the name of the column
-    of times, which must be in seconds. Empty cells are missing
-    samples, NaN. Needs the extra ``data``.
+    units: the unit that each channel must have, by name; other columns are left alone. time: name of the column of
+    times. Empty cells are missing samples, NaN. Needs the extra ``data``.
 
     Raises ValueError, in one line, for a missing channel, another unit, a column twice, a cell that is no number or
     not finite, times that do not increase, and a file that cannot be read as what its name says; ImportError without

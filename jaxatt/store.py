@@ -95,7 +95,7 @@ def create(path: Path, variables: Mapping[str, Variable], manifest: Mapping, tim
 
 
 def open_store(path: Path, mode: Any = "r") -> Store:
-    """The store at path; mode: of Zarr, ``r`` or ``r+``.
+    """The store at path; mode "r" reads, "r+" writes.
 
     Raises FileNotFoundError if there is none, ValueError if it is no campaign.
     """
@@ -195,7 +195,7 @@ def metadata_lock(handle: int):
 
 
 def take(handle: int, path: Path, mine: range) -> None:
-    """Lock my blocks until the lock file is closed. Raises RuntimeError if another process has some of them."""
+    """Lock my blocks until ``handle``, of the lock file, is closed. Raises RuntimeError if another process has some."""
     try:
         fcntl.lockf(handle, fcntl.LOCK_EX | fcntl.LOCK_NB, len(mine), 1 + mine.start)
     except OSError:

@@ -58,7 +58,7 @@ def _scalar(cost: Callable, theta, key) -> None:
 class History(NamedTuple):
     """What a search met, step by step; every leaf leads with the steps, then the starts where there are several."""
 
-    theta: Any  # parameters at which the step was taken
+    theta: Any  # (steps, ...) parameters at which the step was taken
     cost: Any  # (steps,) their cost at the search's key
     gradient: Any  # (steps,) norm of the gradient
     step: Any  # (steps,) [1] factor on the optimizer's update: below 1 after a step that ended in NaN
@@ -113,8 +113,8 @@ def multi_start(
 ) -> tuple[Any, History]:  # fmt: skip
     """`tune` from many starts at once, the first axis of every leaf of thetas; returns the best theta of all.
 
-    One compiled step moves all starts side by side. A start that is not finite stays where it is and costs no other
-    one anything. The best of every start by itself: ``best_of(history)``.
+    One compiled step moves all starts side by side; fresh and the other words as for `tune`. A start that is not
+    finite stays where it is and costs no other one anything. The best of every start: ``best_of(history)``.
 
     Raises what `tune` raises, for the start only if no start is finite.
     """

@@ -31,10 +31,10 @@ NAMES = ("K", "gamma", "P0")
 START = np.array([1.0, 1e-8, 1e-6])  # of the paper's hardware, as far as its words go
 HEAVIEST = 6.4  # [kg m^2] largest true inertia of the scenarios
 FASTEST = float(wm.slew(wm.params, 45.0)[1]) * HEAVIEST / wm.J_WHEEL  # [deg/s] wheel speed that its slew needs
-STABLE = 0.5 / (wm.DT * 2 * FASTEST**2)  # [s/deg^2] gamma up to which the sampled law is stable there (spec, 3.5)
+STABLE = 0.5 / (wm.DT * 2 * FASTEST**2)  # [s/deg^2] gamma up to which the sampled law is stable there (choice 5)
 LOW, HIGH = np.array([0.1, 1e-10, 1e-9]), np.array([30.0, STABLE, 1e-3])
 GAINS = bounded(tuple(LOW), tuple(HIGH))
-CHATTER = 1e-8  # [s^2] weight of the squared step of the desired wheel speed (spec, 7)
+CHATTER = 1e-8  # [s^2] weight of the squared step of the desired wheel speed (docs/loops/wheel_mrac.md)
 COARSE = wm.loop(sampled=True, substeps=4)
 BLUE, ORANGE, GREEN, PINK = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
 

@@ -237,7 +237,7 @@ def margins(params: Params, lambda_max, e_q=0.0, e_w=0.0) -> Margins:
     """The margins at tracking errors of norms e_q [1] and e_w [rad/s], with k_w = k_w0.
 
     lambda_max: largest principal moment of the believed inertia [kg m^2]. Pure: its penalty keeps a search of gains
-    where the proof holds. The adaptation (19) leaves that region in time whatever the gains are.
+    where the proof holds. The adaptation (19) leaves that region in time whatever the gains are (erratum 7).
     """
     eps, k_q = params.eps, params.k_q
     c = eps * lambda_max * e_w + 1 + e_q * e_q
