@@ -22,8 +22,8 @@ import jaxatt
 from benchmarks.measure import c_library, cpu_ns, seconds
 from jaxatt import Fault, Vec3, sweep
 from jaxatt.engine import compiled
-from jaxatt.study import value_and_gradient
 from jaxatt.systems.observer_pd import START_UP, Params, Scenario, Scores, params, scenario, score, system
+from jaxatt.tuning import value_and_gradient
 
 TICKS = 1000
 FORMS = {"shipped": system, "one-step": system._replace(substeps=1, dt=system.dt / system.substeps)}

@@ -6,10 +6,9 @@ import jax
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.patches import Circle
-from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from experiments.report import Report, interval
-from jaxatt import simulate, sweep
+from jaxatt import plot, simulate, sweep
 from jaxatt import singularity as sg
 from jaxatt.controllers import Steering
 from jaxatt.mounting import cmg_triads, modules
@@ -17,12 +16,12 @@ from jaxatt.systems import cmg_loss as cmg
 from jaxatt.vec import Vec3, array
 
 KEY = jax.random.key(0)
-PAPER, SPEC = "Jin & Leeghim (2021)", "spec"
+PAPER, REFERENCE = "Jin & Leeghim (2021)", "reference"
 SKEW = {"pyramid": cmg.PYRAMID, "box-90": cmg.BOX}
 FOUR = {name: cmg.lost(skew, np.zeros(4)).axes for name, skew in SKEW.items()}
 THREE = {name: modules(axes, [0, 1, 2]) for name, axes in FOUR.items()}
 NAMES = np.array(["proper", "lock", "fluctuation"])
-CASES = [  # structure, gamma(0) [deg], class of the paper (text and Table 5), class at the printed K_I (spec, 6)
+CASES = [  # structure, gamma(0) [deg], class of the paper (text and Table 5), class at the printed K_I (docs/loops/cmg_loss.md)
     ("pyramid", (45, 45, 45, 45), 0, 0),
     ("pyramid", (10, 55, 45, -10), 0, 0),
     ("pyramid", (90, 0, -90, 0), 1, None),
@@ -73,7 +72,7 @@ def table_3(report: Report) -> None:
         found = [sg.ill_conditioned(axes, round(360 / step)) for axes in THREE.values()]
         rounded = [round(count / of, 4) for count, of in found]
         report.check(f"Table 3, {step} deg: fractions", fractions, rounded, 1e-9, f"{PAPER}, Table 3")
-        report.check(f"Table 3, {step} deg: counts", list(counts[step]), [c for c, _ in found], 0, f"{SPEC}, 4")
+        report.check(f"Table 3, {step} deg: counts", list(counts[step]), [c for c, _ in found], 0, REFERENCE)
         as_printed = rounded[1] / rounded[0]  # the paper divides rounded fractions
         report.check(f"Table 3, {step} deg: ratio as printed", ratio, as_printed, 5.1e-4, f"{PAPER}, Table 3")
     thresholds = np.array([10, 30, 100, 300, 1000])
@@ -100,18 +99,18 @@ def table_3(report: Report) -> None:
 def geometry(report: Report) -> None:
     """Area of the singular set, envelope, clearance, passability; Table 2 in numbers."""
     area = {name: sg.singular_area(axes) for name, axes in THREE.items()}
-    report.check("area of the singular set, box-90 [(2 pi)^2]", 2 + 2 * 2**0.5, area["box-90"], 1e-6, f"{SPEC}, 4")
-    report.check("area of the singular set, pyramid [(2 pi)^2]", 3.89, area["pyramid"], 0.01, f"{SPEC}, 4")
+    report.check("area of the singular set, box-90 [(2 pi)^2]", 2 + 2 * 2**0.5, area["box-90"], 1e-6, REFERENCE)
+    report.check("area of the singular set, pyramid [(2 pi)^2]", 3.89, area["pyramid"], 0.01, REFERENCE)
     ratio = area["box-90"] / area["pyramid"]
     report.note(f"true area ratio box-90 / pyramid {ratio:.3f}; the paper infers 1.8 from Table 3")
 
     free = {name: sg.clearance(axes, np.zeros(3)) for name, axes in THREE.items()}
-    report.check("ball free of singularities, 3 modules, box-90", 1, free["box-90"], 1e-6, f"{SPEC}, 7")
-    report.check("ball free of singularities, 3 modules, pyramid", 0.15419, free["pyramid"], 1e-4, f"{SPEC}, 7")
+    report.check("ball free of singularities, 3 modules, box-90", 1, free["box-90"], 1e-6, REFERENCE)
+    report.check("ball free of singularities, 3 modules, pyramid", 0.15419, free["pyramid"], 1e-4, REFERENCE)
     axis = {"pyramid": [2.15572, 2.30991, 2.37880], "box-90": [1, 3**0.5, 3]}
     for name, axes in THREE.items():
         reach = np.asarray(sg.reach(axes, Vec3(*np.eye(3))))
-        report.check(f"reach along x, y, z, 3 modules, {name}", axis[name], reach, 1e-5, f"{SPEC}, 7")
+        report.check(f"reach along x, y, z, 3 modules, {name}", axis[name], reach, 1e-5, REFERENCE)
     envelopes = {
         (name, n): sg.envelope(axes, 400) for n, group in ((4, FOUR), (3, THREE)) for name, axes in group.items()
     }
@@ -144,20 +143,18 @@ def geometry(report: Report) -> None:
 def surfaces(report: Report) -> None:
     """Figures 3, 4, 13-16: singular surfaces; figure 5: singular gimbal angles."""
     for name in SKEW:
-        fig = plt.figure(figsize=(12, 8))
+        fig = plt.figure(figsize=(12, 9))
         panels = [(FOUR, 4, (1, 1, 1, 1)), (FOUR, 4, (1, 1, 1, -1)), (FOUR, 4, (1, 1, -1, -1))]
         panels += [(THREE, 3, (1, 1, 1)), (THREE, 3, (1, 1, -1))]
         for i, (group, n, example) in enumerate(panels):
             ax = fig.add_subplot(2, 3, i + 1, projection="3d")
             minus = example.count(-1)
-            draw_surface(ax, group[name], minus)
+            plot.singular_surface(group[name], minus, ax)
             kind = "external" if minus == 0 else f"internal, {minus} of {n} reversed"
             size = 4 if name == "box-90" else 3
             ax.set(xlim=(-size, size), ylim=(-size, size), zlim=(-size, size), title=f"{n} modules, {kind}")
-            ax.set(xlabel="$h_x / h_w$", ylabel="$h_y / h_w$", zlabel="$h_z / h_w$")
-            ax.set_box_aspect((1, 1, 1))
         fig.suptitle(f"Singular momenta, {name}; circles and discs: gimbal axis along the singular direction")
-        fig.tight_layout(w_pad=3)
+        fig.tight_layout(w_pad=3, h_pad=4)
         report.figure(f"figures_3_4_13_16_{name}", fig)
 
     grid = np.radians(3.0) * np.arange(120)
@@ -175,36 +172,6 @@ def surfaces(report: Report) -> None:
     report.figure("figure_5_singular_angles", fig)
 
 
-def draw_surface(ax, axes, minus: int) -> None:
-    """The surfaces of all sign patterns with so many modules reversed, and the rims of their holes."""
-    polar, around = np.meshgrid(np.linspace(0, np.pi, 81), np.linspace(0, 2 * np.pi, 161), indexing="ij")
-    u = Vec3(np.sin(polar) * np.cos(around), np.sin(polar) * np.sin(around), np.cos(polar))
-    n = axes.r.x.shape[0]
-    patterns = [e for e in sg.sign_patterns(n) if min((e < 0).sum(), n - (e < 0).sum()) == minus]
-    for signs in patterns:
-        h, _ = sg.singular_momentum(axes, Vec3(*(a.ravel() for a in u)), signs)
-        p = np.asarray(array(h)).T.reshape(81, 161, 3)
-        quads = np.stack([p[:-1, :-1], p[1:, :-1], p[1:, 1:], p[:-1, 1:]], axis=2).reshape(-1, 4, 3)
-        whole = np.linalg.norm(quads - np.roll(quads, 1, axis=1), axis=-1).max(1) < 1.1  # no bridge over a hole
-        quads = quads[whole & np.isfinite(quads).all((1, 2))]
-        height = quads[:, :, 2].mean(1)
-        colours = plt.get_cmap("viridis")(0.5 + height / 7)
-        ax.add_collection3d(Poly3DCollection(quads, facecolors=colours, alpha=0.35 if minus else 0.8, linewidths=0))
-    turn = np.linspace(0, 2 * np.pi, 80)
-    for rim in sg.rims(axes):
-        if (rim.modules == 1) or minus:
-            e = np.cross(rim.normal, [0.3, 0.5, 0.8])
-            e /= np.linalg.norm(e)
-            circle = rim.centre + rim.modules * (
-                np.cos(turn)[:, None] * e + np.sin(turn)[:, None] * np.cross(rim.normal, e)
-            )
-            for sign in (1, -1):
-                if rim.modules > 1:
-                    disc = Poly3DCollection([sign * circle], facecolor=COLOURS[1], alpha=0.12)
-                    ax.add_collection3d(disc)
-                ax.plot(*(sign * circle).T, color=COLOURS[1], linewidth=0.6)
-
-
 # section 3.4
 
 
@@ -220,18 +187,18 @@ def table_5(report: Report) -> None:
         got = sweep(cmg.system, params, stacked(moved), KEY, ticks=TICKS, score=cmg.score, progress=False)
         classes = cmg.classify(got).reshape(10, -1)
         expected = [case[2] if params is cmg.table5 else case[3] for case in CASES]
-        source = f"{PAPER}, Table 5" if params is cmg.table5 else f"{SPEC}, 6"
+        source = f"{PAPER}, Table 5" if params is cmg.table5 else REFERENCE
         for i, case in enumerate(CASES):
             name = f"{preset}: {case[0]} {list(case[1])}"
             held = np.mean(classes[1:, i] == classes[0, i])
             if expected[i] is None:
-                report.note(f"{name}: {NAMES[classes[0, i]]}; rounding decides (spec, 6)")
+                report.note(f"{name}: {NAMES[classes[0, i]]}; rounding decides (docs/loops/cmg_loss.md)")
             else:
                 report.check(f"{name}: {NAMES[expected[i]]}", expected[i], int(classes[0, i]), 0, source)
                 if (case[1], params is cmg.table5) not in (((90, 0, -90, 0), True), ((-90, 90, 90, 95), True)) or (
                     case[0] == "box-90"
                 ):
-                    report.check(f"{name}: class kept at 1e-13 rad", 1, held, 0, f"{SPEC}, 10.5")
+                    report.check(f"{name}: class kept at 1e-13 rad", 1, held, 0, REFERENCE)
             report.note(f"    variation {got.variation[i]:.4g} rad/s, settling {got.settling[i]:.4g} s")
     delicate = [((90, 0, -90, 0), "K_I = 0.02"), ((90, 0, -90, 0), "K_I = 0"), ((-90, 90, 90, 95), "K_I = 0")]
     for gamma, preset in delicate:
@@ -265,13 +232,13 @@ def ties(report: Report) -> None:
 
         found = sg.rearrange(THREE[name], np.radians(start), rank=rank)
         head = f"rearranged {name} {list(start)}"
-        report.relative(f"{head}: condition", kappa, found.condition[0], 1e-8, f"{SPEC}, 5")
-        report.check(f"{head}: number of ties", number, len(found.gamma), 0, f"{SPEC}, 5")
+        report.relative(f"{head}: condition", kappa, found.condition[0], 1e-8, REFERENCE)
+        report.check(f"{head}: number of ties", number, len(found.gamma), 0, REFERENCE)
         for gamma in found.gamma:
             degrees, variation = np.degrees(gamma).round().astype(int).tolist(), ranks[tuple(gamma)]
             report.note(f"    {degrees}: variation {variation:.4g} rad/s at K_I = 0")
         ends = sg.rearrange_by_gradient(THREE[name], np.radians(start))
-        report.within(f"{head}: condition by gradient", 1, kappa * (1 + 1e-6), ends.condition, f"{SPEC}, 9")
+        report.within(f"{head}: condition by gradient", 1, kappa * (1 + 1e-6), ends.condition, REFERENCE)
 
 
 def rearranged(structure: str, lost_module: int, gamma):
@@ -314,7 +281,7 @@ def monte_carlo(report: Report) -> None:
         params = cmg.table5._replace(steering=steering)
         for how, batch in batches.items():
             got = sweep(system, params, batch, KEY, ticks=TICKS, score=cmg.score, progress=False)
-            report.within(f"Monte Carlo, {law}, {how}: finite runs", 1, 1, np.mean(got.ok), SPEC)
+            report.within(f"Monte Carlo, {law}, {how}: finite runs", 1, 1, np.mean(got.ok), REFERENCE)
             classes[law, how] = cmg.classify(got)
     report.note(f"{len(ill) * len(classes)} runs, K_I = 0, 10 ms plant step; 95 % intervals")
     groups = {
@@ -349,7 +316,7 @@ def monte_carlo(report: Report) -> None:
         coarse = classes["pseudo-inverse", "as drawn"][::8]
         shares = [[np.mean(c == k) for k in range(3)] for c in (fine, coarse)]
         # two standard deviations of a share of 256 runs: 0.0625
-        report.check("Monte Carlo: shares at 10 ms equal those at 1 ms", shares[0], shares[1], 0.0625, SPEC)
+        report.check("Monte Carlo: shares at 10 ms equal those at 1 ms", shares[0], shares[1], 0.0625, REFERENCE)
 
 
 def histories(report: Report) -> None:
@@ -364,10 +331,10 @@ def histories(report: Report) -> None:
     for preset, log in logs.items():
         kappa, w = np.asarray(log.condition)[::2, 0], np.linalg.norm(array(log.w), axis=0)[:, 0]
         height, at, settling = peaks[preset]
-        report.check(f"figure 7, {preset}: peak condition", height, kappa.max(), 0.05, f"{SPEC}, 10.5")
-        report.check(f"figure 7, {preset}: its time [s]", at, 0.1 * kappa.argmax(), 0.1, f"{SPEC}, 10.5")
+        report.check(f"figure 7, {preset}: peak condition", height, kappa.max(), 0.05, REFERENCE)
+        report.check(f"figure 7, {preset}: its time [s]", at, 0.1 * kappa.argmax(), 0.1, REFERENCE)
         last = t[np.flatnonzero(w > 0.05 * w[0])[-1]]
-        report.check(f"figure 7, {preset}: 5 % settling [s]", settling, last, 0.1, f"{SPEC}, 10.5")
+        report.check(f"figure 7, {preset}: 5 % settling [s]", settling, last, 0.1, REFERENCE)
     for lane, number in enumerate(figures):
         name, gamma, *_ = CASES[order[lane]]
         fig, axs = plt.subplots(4, 2, figsize=(11, 9), sharex=True, sharey="row")

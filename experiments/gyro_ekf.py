@@ -15,6 +15,7 @@ import numpy as np
 
 import jaxatt
 from experiments.report import interval
+from jaxatt import plot
 from jaxatt.attitude import quat_from_euler, quat_rotate
 from jaxatt.faults import Fault, dead
 from jaxatt.linear import growth_rates, observability_rank, sampled
@@ -563,16 +564,8 @@ def filter_figure(report, name: str, t, runs: dict) -> None:
 
 
 def table_figure(report, angle, t) -> None:
-    """The sixteen subsets: growth rates without the filter, settling with it."""
-    fig, (top, bottom) = plt.subplots(2, 1, figsize=(11, 6), sharex=True)
-    place = np.arange(16)
-    for offset, mode, rates, colour in ((-0.2, "zero", ZERO, COLOURS[0]), (0.2, "pinv", PINV, COLOURS[1])):
-        top.bar(place + offset, np.array(rates) * 1e-3, 0.4, color=colour, label=f"`{mode}`")
-    top.axhline(0, color="k", lw=0.8)
-    top.set(ylabel="growth rate [1e-3 / s]", title="without the filter: positive rates diverge")
-    top.legend()
-    bottom.bar(place, [settled(t, angle[..., i]) for i in range(16)], 0.6, color=COLOURS[2])
-    bottom.set(ylabel="settling to 0.01 deg [s]", xlabel="dead gyros", title="with the filter: all settle")
-    bottom.set_xticks(place, [s or "none" for s in SUBSETS])
-    fig.tight_layout()
-    report.figure("sixteen_subsets", fig)
+    """The sixteen subsets: growth rates without the filter (positive ones diverge), settling with it."""
+    growth = {f"no filter, `{mode}`": np.array(rates) * 1e-3 for mode, rates in (("zero", ZERO), ("pinv", PINV))}
+    settling = [settled(t, angle[..., i]) for i in range(16)]
+    axes = plot.subsets(mask(*SUBSETS).T, {"growth rate [1e-3/s]": growth, "settling with the filter [s]": settling})
+    report.figure("sixteen_subsets", axes[0].figure)

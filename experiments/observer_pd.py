@@ -19,8 +19,9 @@ from jaxatt.attitude import mrp_matrix, mrp_rate, mrp_rate_transposed
 from jaxatt.bodies import body_acceleration
 from jaxatt.engine import rk4
 from jaxatt.estimators import AttitudeRate, mrp_observer
-from jaxatt.study import batch, value_and_gradient
+from jaxatt.study import batch
 from jaxatt.systems import observer_pd as op
+from jaxatt.tuning import value_and_gradient
 from jaxatt.vec import array, cross, inverse, norm, vec3
 
 HEALTHY = on_axes(Fault())
@@ -28,7 +29,7 @@ QUIET = op.scenario._replace(star=HEALTHY, gyro=HEALTHY, std_q=0.0, std_w=0.0)
 FINE = op.system._replace(dt=0.01, substeps=1)  # the grid of the reference numbers
 ZERO = Vec3(0.0, 0.0, 0.0)
 KEY = jax.random.key(2020)
-SPEC = "independent implementation"
+REFERENCE = "independent implementation"
 
 
 def run(report) -> None:
@@ -61,13 +62,13 @@ def mathematics(report) -> None:
             - e_w @ mrp_rate_transposed(y.q, n_q)
         )  # fmt: skip
         report.check(
-            f"V' identity of the observer, {label} readings", 0, np.abs(dV - exact).max(), 1e-10, "V'; spec 5.3"
+            f"V' identity of the observer, {label} readings", 0, np.abs(dV - exact).max(), 1e-10, "V'; reference"
         )
 
     q = draw()
     G = np.stack([array(mrp_rate(q, vec3([np.full(1000, a) for a in e]))) for e in np.eye(3)], axis=1)
     excess = np.linalg.norm(np.moveaxis(G, -1, 0), 2, axis=(1, 2)) - (1 + np.asarray(q @ q)) / 4
-    report.check("|G(q)| - (1 + |q|^2)/4", 0, np.abs(excess).max(), 1e-12, "spec 5.5")
+    report.check("|G(q)| - (1 + |q|^2)/4", 0, np.abs(excess).max(), 1e-12, "reference")
 
     def flow(t, x):
         return AttitudeRate(mrp_rate(x.q, x.w), body_acceleration(x.w, ZERO, J, J_inv))
@@ -76,7 +77,7 @@ def mathematics(report) -> None:
     end, _ = jax.lax.scan(lambda x, _: (rk4(flow, 0.0, x, 0.001), None), start, None, 20_000)
     momentum = [mrp_matrix(x.q) @ (J @ x.w) for x in (start, end)]
     drift = norm(momentum[1] - momentum[0]) / norm(momentum[0])
-    report.check("torque-free momentum drift, 20 s", 0, float(drift), 1e-9, "eq. (4), spec 5.1")
+    report.check("torque-free momentum drift, 20 s", 0, float(drift), 1e-9, "eq. (4), reference")
 
     theta = jnp.log(jnp.array([1.1, 15.0, 330.0, 125.0]))
     scenario = op.scenario._replace(q_hat=Vec3(0.35, 0.2, -0.6), gyro=on_axes(Fault(5.0, bias=0.02)))
@@ -114,19 +115,19 @@ def nominal(report) -> None:
     for sign, settling, label in ((-1.0, 5.22, "Euler"), (1.0, 5.31, "as printed")):
         log = simulate(FINE, op.params._replace(sign=sign), QUIET._replace(sign=sign), KEY, ticks=1000)
         name = f"|q| < 0.01 after [s], dynamics {label}"
-        report.check(name, settling, last_outside(norm(log.q), 0.01, 0.01) + 0.01, 0.02, SPEC)
+        report.check(name, settling, last_outside(norm(log.q), 0.01, 0.01) + 0.01, 0.02, REFERENCE)
         if sign < 0:
-            report.check("peak |u| [N m]", 147.52, float(norm(log.u).max()), 0.01, SPEC)
+            report.check("peak |u| [N m]", 147.52, float(norm(log.u).max()), 0.01, REFERENCE)
     log = simulate(FINE, op.params, QUIET._replace(q_hat=ZERO, w_hat=ZERO), KEY, ticks=1200)
-    report.check("observer from zero: |xi(0)|", 1.514188, float(log.xi[0]), 1e-6, SPEC)
-    report.check("observer from zero: last above sigma [s]", 8.86, last_outside(log.xi, 0.01, 0.01), 0.02, SPEC)
+    report.check("observer from zero: |xi(0)|", 1.514188, float(log.xi[0]), 1e-6, REFERENCE)
+    report.check("observer from zero: last above sigma [s]", 8.86, last_outside(log.xi, 0.01, 0.01), 0.02, REFERENCE)
     log = simulate(op.system, op.params._replace(eps=0.00304), QUIET, KEY, ticks=601)
-    report.check("k_w at 60 s, eps = 0.00304 [N m s]", 1.5726, float(log.k_w[-1]), 0.001, "eq. (19), spec 6")
+    report.check("k_w at 60 s, eps = 0.00304 [N m s]", 1.5726, float(log.k_w[-1]), 0.001, "eq. (19), reference")
     report.within("least k_w of that run [N m s]", 1.5715, None, float(log.k_w.min()), "never below h(0)")
     faults = QUIET._replace(star=on_axes(Fault(250.0, bias=0.03)), gyro=on_axes(Fault(150.0, bias=0.03)))
     log = simulate(op.system, op.params, faults, KEY, ticks=3500)
     name = "constant faults of 0.03: |xi| before, after 250 s"
-    report.relative(name, [0.0119, 0.0119], [float(log.xi[2490]), float(log.xi[-1])], 0.02, "spec 4")
+    report.relative(name, [0.0119, 0.0119], [float(log.xi[2490]), float(log.xi[-1])], 0.02, "reference")
 
 
 def marked(ax, ylabel: str) -> None:
@@ -199,8 +200,10 @@ def monte_carlo(report) -> None:
         for span, (xi, share, q, w), got in zip(("60-150", "150-250", "250-350"), rows, swept):
             rms = [float(np.sqrt(a.mean())) for a in (got[0], got[2], got[3])]
             name = f"eps {eps}, {span} s: rms |xi|, |e_q|, |e_w|"
-            report.relative(name, [xi, q, w], rms, 0.03 if eps == 0.1 else 0.06, f"{SPEC}, {n} runs")
-            report.check(f"eps {eps}, {span} s: share above sigma", share, got[1].mean(), 0.002, f"{SPEC}, {n} runs")
+            report.relative(name, [xi, q, w], rms, 0.03 if eps == 0.1 else 0.06, f"{REFERENCE}, {n} runs")
+            report.check(
+                f"eps {eps}, {span} s: share above sigma", share, got[1].mean(), 0.002, f"{REFERENCE}, {n} runs"
+            )
 
 
 def fault_sizes(report) -> None:
@@ -253,9 +256,9 @@ def fault_sizes(report) -> None:
     report.figure("fault_sizes", fig)
     loud = by_case.miss[[k for k, c in enumerate(cases) if c[0] == "gyro" and c[1] == "random" and c[2] > 0.09]]
     report.within("miss share, random gyro fault of 0.1 rad/s", None, 0.01, loud.mean(), "ten times the threshold")
-    # A constant star-sensor bias is absorbed (DC gain 0), whatever its size: spec 4.
+    # A constant star-sensor bias is absorbed (DC gain 0), whatever its size: reference.
     star = by_case.miss[[k for k, c in enumerate(cases) if c[0] == "star" and c[1] == "bias"]]
-    report.within("least miss share, constant star-sensor bias", 0.5, None, star.mean(1).min(), "DC gain 0, spec 4")
+    report.within("least miss share, constant star-sensor bias", 0.5, None, star.mean(1).min(), "DC gain 0, reference")
 
 
 def tuning_scenarios(n: int, seed: int):

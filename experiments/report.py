@@ -13,6 +13,8 @@ import numpy as np
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
+from jaxatt.detection import interval as interval  # beside the checks, for the experiments
+
 
 class Report:
     """Collects checks and figures of the experiments of one run. quick: shrink Monte Carlo sizes only."""
@@ -76,14 +78,6 @@ class Report:
         row = f"{name.split(': ', 1)[1]:58} {_short(expected):>26} {_short(measured):>26} {_short(tolerance):>12}"
         print(row, " ok" if ok else " NOT OK", flush=True)
         return ok
-
-
-def interval(successes: int, trials: int, z: float = 1.959964) -> tuple[float, float]:
-    """Wilson's 95 % confidence interval of a share."""
-    p, n = successes / trials, trials
-    centre = (p + z * z / (2 * n)) / (1 + z * z / n)
-    half = z / (1 + z * z / n) * float(np.sqrt(p * (1 - p) / n + z * z / (4 * n * n)))
-    return max(0.0, centre - half), min(1.0, centre + half)
 
 
 def _plain(a):

@@ -1,7 +1,7 @@
 """Eun, Park & Park (2016): figures 3-11, the loop the paper leaves out, faults, a large sweep, tuning.
 
 The paper gives its results as figures, of which only the words were available: "paper" below is such a claim,
-"spec" a number of an independent implementation with NumPy's generator, seed 1.
+"reference" a number of an independent implementation with NumPy's generator, seed 1.
 """
 
 from __future__ import annotations
@@ -70,39 +70,39 @@ def peak(a):
 def paper_case(report: Report):
     """Without and with noise, MRAC only and with estimation; the logs of seed 1."""
     log = runs([(wm.mrac_only, QUIET), (wm.params, QUIET)], uniform([1]))
-    report.check("noise-free: max error MRAC, +OPE [deg]", [0.21402, 0.03614], peak(log.error), 1e-4, "spec 8.1")
+    report.check("noise-free: max error MRAC, +OPE [deg]", [0.21402, 0.03614], peak(log.error), 1e-4, "reference")
     ends = [log.a_r[-1, 0], log.a_y[-1, 0]]
-    report.check("noise-free: a_r, a_y at 90 s", [0.70477, -0.20253], ends, 1e-4, "spec 8.1")
-    report.check("noise-free: J_hat at 20, 90 s", [5.42091, 5.42100], log.J_hat[[1000, 4500], 1], 1e-4, "spec 8.1")
+    report.check("noise-free: a_r, a_y at 90 s", [0.70477, -0.20253], ends, 1e-4, "reference")
+    report.check("noise-free: J_hat at 20, 90 s", [5.42091, 5.42100], log.J_hat[[1000, 4500], 1], 1e-4, "reference")
     n = 8 if report.quick else 64
     noise = uniform(range(1, n + 1))
     pairs = [(wm.mrac_only, wm.scenario)] * n + [(wm.params, wm.scenario)] * n
     log = runs(pairs, jnp.concatenate([noise, noise], axis=-1))
     alone, both = (jax.tree.map(lambda a, s=s: a[:, s], log) for s in (slice(None, n), slice(n, None)))
-    report.within("Fig. 4a: max measured error [deg], all seeds", 0.255, 0.272, peak(alone.measured), "spec 8.2")
+    report.within("Fig. 4a: max measured error [deg], all seeds", 0.255, 0.272, peak(alone.measured), "reference")
     ratio = peak(both.measured[LATE]) / peak(alone.measured[LATE])
-    report.within("Fig. 7a: ratio of max errors after 10 s, seed 1", 0.22, 0.25, ratio[0], "spec 8.2, paper 1/5")
-    report.within("  the same, median of all seeds", 0.22, 0.25, np.median(ratio), "spec 8.2")
+    report.within("Fig. 7a: ratio of max errors after 10 s, seed 1", 0.22, 0.25, ratio[0], "reference, paper 1/5")
+    report.within("  the same, median of all seeds", 0.22, 0.25, np.median(ratio), "reference")
     report.note(
         f"ratio over {n} seeds: {ratio.min():.3f} to {ratio.max():.3f}, "
         f"{np.mean((ratio >= 0.22) & (ratio <= 0.25)):.0%} within 0.22 to 0.25: a maximum of noise has a tail"
     )
     ratio = rms(both.measured[LATE]) / rms(alone.measured[LATE])
-    report.check("  ratio of rms errors after 10 s, seed 1", 0.25, ratio[0], 0.01, "spec 8.2")
-    report.check("  the same, median of all seeds", 0.25, np.median(ratio), 0.01, "spec 8.2")
+    report.check("  ratio of rms errors after 10 s, seed 1", 0.25, ratio[0], 0.01, "reference")
+    report.check("  the same, median of all seeds", 0.25, np.median(ratio), 0.01, "reference")
     report.note(f"rms ratio over {n} seeds: {ratio.min():.3f} to {ratio.max():.3f}")
     ratio = peak(both.error) / peak(alone.error)
-    report.within("  ratio of max true errors, all seeds", 1 / 6.5, 1 / 5.5, ratio, "spec 2 (1/6.0); paper 1/5")
-    report.check("Fig. 8b: J_hat at 90 s, all seeds", 5.4210, both.J_hat[-1], 2e-4, "spec 8.2")
+    report.within("  ratio of max true errors, all seeds", 1 / 6.5, 1 / 5.5, ratio, "reference (1/6.0); paper 1/5")
+    report.check("Fig. 8b: J_hat at 90 s, all seeds", 5.4210, both.J_hat[-1], 2e-4, "reference")
     changes = [np.median(rms(np.diff(a.r[LATE], axis=0))) for a in (alone, both)]
-    report.check("Figs. 4b, 7b: rms step of r, median [deg/s]", [287, 10.5], changes, [10, 0.2], "spec 8.2")
+    report.check("Figs. 4b, 7b: rms step of r, median [deg/s]", [287, 10.5], changes, [10, 0.2], "reference")
     ends = [alone.a_r[-1, 0], alone.a_y[-1, 0]]
-    report.check("Fig. 5: a_r, a_y at 90 s, seed 1", [0.670, -0.169], ends, 1e-3, "spec 2")
+    report.check("Fig. 5: a_r, a_y at 90 s, seed 1", [0.670, -0.169], ends, 1e-3, "reference")
     return jax.tree.map(lambda a: a[:, 0], alone), jax.tree.map(lambda a: a[:, 0], both)
 
 
 def least_squares_in_closed_form(report: Report):
-    """The estimator on noise-free data along the slew: four choices of regressor and units (spec, 3.3)."""
+    """The estimator on noise-free data along the slew: four choices of regressor and units (docs/loops/wheel_mrac.md)."""
     target, rate = wm.slew(wm.params, (np.arange(TICKS - 1) + 0.5) * wm.DT)
     a = -wm.J_WHEEL / 5.421
     W = jnp.stack([target, target, rate, rate], axis=-1) / a
@@ -110,7 +110,7 @@ def least_squares_in_closed_form(report: Report):
     start = LeastSquares(jnp.full(4, -wm.J_WHEEL / 5), P0)
     end, _ = jax.lax.scan(lambda e, w: (least_squares(e, w, w * a, wm.DT), None), start, W)
     expected = [5.42099997, 5.420912, 5.420949, 5.300715]
-    report.check("J_hat: attitude deg, rad, rate deg, rad", expected, -wm.J_WHEEL / end.a, 1e-5, "spec 8.3")
+    report.check("J_hat: attitude deg, rad, rate deg, rad", expected, -wm.J_WHEEL / end.a, 1e-5, "reference")
 
 
 def spectral_radius(speed, gamma=1e-6):
@@ -129,28 +129,28 @@ def spectral_radius(speed, gamma=1e-6):
 
 
 def sampled_adaptation(report: Report):
-    """The law at 50 Hz by forward Euler: where it is stable, and what happens beyond (spec, 3.5)."""
+    """The law at 50 Hz by forward Euler: where it is stable, and what happens beyond (docs/loops/wheel_mrac.md)."""
     radii = [spectral_radius(3500.0), spectral_radius(3540.0)]
-    report.check("sampled: spectral radius, 3500, 3540 deg/s", [0.9982, 1.0002], radii, 1e-4, "spec 8.4")
-    report.check("  at the slew's 19257 deg/s", 2.49, spectral_radius(19257.0), 5e-3, "spec 3.5")
+    report.check("sampled: spectral radius, 3500, 3540 deg/s", [0.9982, 1.0002], radii, 1e-4, "reference")
+    report.check("  at the slew's 19257 deg/s", 2.49, spectral_radius(19257.0), 5e-3, "reference")
     bound = mrac_sampled_bound(Adaptation(), wm.DT, 10.0, 20.0)
-    report.check("  bound on |y| [deg/s]", 3535.5, np.sqrt(bound / 2), 0.1, "spec 3.5")
+    report.check("  bound on |y| [deg/s]", 3535.5, np.sqrt(bound / 2), 0.1, "reference")
     gains = [1e-6, 1e-7, 3e-8, 1e-8]
     pairs = [(wm.mrac_only._replace(law=Adaptation(gamma=g)), QUIET) for g in gains]
     log = runs(pairs, uniform([1]), wm.sampled)
     first = lambda on: times[np.argmax(on)]
     report.check(
-        "  diverges at gamma 1e-6, 1e-7, 3e-8, 1e-8", [1, 0, 0, 0], log.failed[-1].astype(float), 0, "spec 8.4"
+        "  diverges at gamma 1e-6, 1e-7, 3e-8, 1e-8", [1, 0, 0, 0], log.failed[-1].astype(float), 0, "reference"
     )
     alarm = first(log.alarm[:, 0] & LATE & (times > 20))
-    report.check("  gamma 1e-6: |y - y_m| > 50 deg/s at [s]", 25.96, alarm, 0.02, "spec 3.5")
-    report.note(f"gamma 1e-6: |y| > {wm.RUNAWAY:g} deg/s at {first(log.failed[:, 0]):.2f} s (spec, 3.5: 38.3 s)")
-    report.check("  gamma 1e-7: a_r, a_y run off to", [2.1, -1.6], [log.a_r[-1, 1], log.a_y[-1, 1]], 0.05, "spec 3.5")
-    report.check("  gamma 1e-7: max error [deg]", 0.31, peak(log.error)[1], 0.005, "spec 3.5")
+    report.check("  gamma 1e-6: |y - y_m| > 50 deg/s at [s]", 25.96, alarm, 0.02, "reference")
+    report.note(f"gamma 1e-6: |y| > {wm.RUNAWAY:g} deg/s at {first(log.failed[:, 0]):.2f} s (reference: 38.3 s)")
+    report.check("  gamma 1e-7: a_r, a_y run off to", [2.1, -1.6], [log.a_r[-1, 1], log.a_y[-1, 1]], 0.05, "reference")
+    report.check("  gamma 1e-7: max error [deg]", 0.31, peak(log.error)[1], 0.005, "reference")
 
 
 def hardware(report: Report):
-    """What a wheel that sticks at low speed does to MRAC (spec, 4), in one batch but for the continuous law."""
+    """What a wheel that sticks at low speed does to MRAC (docs/loops/wheel_mrac.md), in one batch but for the continuous law."""
     base, scenario = wm.hardware_params, wm.hardware_scenario
     with_wheel = lambda wheel: (base, scenario._replace(wheel=wheel))
     free = scenario._replace(wheel=Wheel())
@@ -175,16 +175,16 @@ def hardware(report: Report):
     for i, (name, (_, errors, swings)) in enumerate(table.items()):
         # the gate's edge is smoothed here, a hard one in the reference
         tolerance = 0.01 if name.startswith("gate") else 6e-4
-        report.check(f"{name}: max error in 3 windows", errors, peaks[i], tolerance, "spec 4 [deg]")
+        report.check(f"{name}: max error in 3 windows", errors, peaks[i], tolerance, "reference [deg]")
         if swings:
-            report.check("  peak to peak of r - ideal", swings, spans[i], 1.0, "spec 4 [deg/s]")
+            report.check("  peak to peak of r - ideal", swings, spans[i], 1.0, "reference [deg/s]")
     continuous = runs([(base._replace(law=Adaptation()), scenario)], noise, wm.loop(substeps=10))
     found = [peak(continuous.error[w])[0] for w in WINDOWS]
-    report.check("friction, continuous, gamma 1e-6: max error", [0.078, 0.013, 0.021], found, 6e-4, "spec 4 [deg]")
-    report.within("hardware: max error [deg]", None, 0.25, peaks[0].max(), "spec 8.5, paper Fig. 10a")
-    report.within("  swings at the ends over the middle", 3, None, spans[0, [0, 2]] / spans[0, 1], "spec 8.5")
+    report.check("friction, continuous, gamma 1e-6: max error", [0.078, 0.013, 0.021], found, 6e-4, "reference [deg]")
+    report.within("hardware: max error [deg]", None, 0.25, peaks[0].max(), "reference, paper Fig. 10a")
+    report.within("  swings at the ends over the middle", 3, None, spans[0, [0, 2]] / spans[0, 1], "reference")
     means = [np.abs(log.measured[:, i]).mean() for i in (0, 4)]
-    report.check("  mean measured error, J_hat exact, 5 [deg]", [0.0378, 0.1125], means, 2e-4, "spec 4")
+    report.check("  mean measured error, J_hat exact, 5 [deg]", [0.0378, 0.1125], means, 2e-4, "reference")
     one = jax.tree.map(lambda a: a[:, 0], log)
     report.figure("fig09_hardware_attitude", attitude_figure(one, "Hardware preset: MRAC only (Fig. 9)"))
     report.figure("fig10_hardware_error", error_figure(one, "Hardware preset: MRAC only (Fig. 10)"))
@@ -201,7 +201,7 @@ def hardware(report: Report):
 
 
 def loop_choice(report: Report):
-    """K, feed-forward, noise law, regressor, units and start of the parameters, all in one batch (spec, 3)."""
+    """K, feed-forward, noise law, regressor, units and start of the parameters, all in one batch (docs/loops/wheel_mrac.md)."""
     alone, both = wm.mrac_only, wm.params
     rad = Adaptation(gamma=1e-6 * wm.PER_RAD2)
     gains, free_gains, rad_gains, fast = [0.5, 1, 2, 5, 10, 20], [1, 5, 10, 15], [1, 5, 10], [1, 20, 40, 60, 80, 90]
@@ -229,7 +229,7 @@ def loop_choice(report: Report):
     true = {k: peak(v.error) for k, v in part.items()}
     measured = {k: peak(v.measured) for k, v in part.items()}
     half = 6e-4  # of the last digit given, and a little
-    source = "spec 3.2 [deg]"
+    source = "reference [deg]"
     name = "loop: K = 0.5 ... 20"
     report.check(f"{name}, MRAC, true", [0.425, 0.217, 0.115, 0.058, 0.046, 0.053], true["alone"], half, source)
     report.check("  measured", [0.473, 0.264, 0.162, 0.106, 0.092, 0.096], measured["alone"], half, source)
@@ -238,22 +238,24 @@ def loop_choice(report: Report):
     report.check("loop: no feed-forward, K = 1, 5, 10, 15", expected, true["alone, no ff"], [6e-3] + [half] * 3, source)
     expected = [2.53, 0.505, 0.252, 0.168]
     report.check("  +OPE", expected, true["both, no ff"], [6e-3] + [half] * 3, source)
-    report.check("loop: gains per rad, K = 1, 5, 10", [1.116, 0.238, 0.292], true["alone, rad"], half, "spec 3.1 [deg]")
-    report.check("  +OPE", [1.106, 0.221, 0.313], true["both, rad"], half, "spec 3.1 [deg]")
-    report.check("  +OPE, K = 1: J_hat at 20 s", 5.258, part["both, rad"].J_hat[1000, 0], half, "spec 3.1")
-    report.check("loop: estimator on differenced attitude", 0.268, true["rates"][0], half, "spec 3.3 [deg]")
+    report.check(
+        "loop: gains per rad, K = 1, 5, 10", [1.116, 0.238, 0.292], true["alone, rad"], half, "reference [deg]"
+    )
+    report.check("  +OPE", [1.106, 0.221, 0.313], true["both, rad"], half, "reference [deg]")
+    report.check("  +OPE, K = 1: J_hat at 20 s", 5.258, part["both, rad"].J_hat[1000, 0], half, "reference")
+    report.check("loop: estimator on differenced attitude", 0.268, true["rates"][0], half, "reference [deg]")
     gauss = measured["gaussian"]
     report.check("loop: Gaussian noise, std 0.05/3, 0.05", [0.259, 0.355], gauss[[0, 2]], half, source)
     report.check("  std 0.05, +OPE", 0.19, gauss[3], 0.006, source)
     late = peak(part["exact J"].measured[LATE])
-    report.check("loop: exact J, K = 1, after 10 s", 0.065, late[0], 1e-3, "spec 3.2 [deg]")
-    report.relative("  K = 20, 40, 60, 80, 90", [0.09, 0.117, 0.17, 0.21, 0.31], late[1:], 0.06, "spec 3.2 [deg]")
+    report.check("loop: exact J, K = 1, after 10 s", 0.065, late[0], 1e-3, "reference [deg]")
+    report.relative("  K = 20, 40, 60, 80, 90", [0.09, 0.117, 0.17, 0.21, 0.31], late[1:], 0.06, "reference [deg]")
     ends = np.stack([part["starts"].a_r[-1], part["starts"].a_y[-1]], axis=-1)
     expected = [[0.7048, -0.2025], [0.7887, -0.2855], [0.2556, 0.2417], [0.8531, -0.3492]]
-    report.check("parameters at 90 s from 4 starts", np.ravel(expected), ends.ravel(), 1e-4, "spec 3.4")
-    report.within("  their sums", 0.497, 0.504, ends.sum(axis=-1), "spec 3.4")
+    report.check("parameters at 90 s from 4 starts", np.ravel(expected), ends.ravel(), 1e-4, "reference")
+    report.within("  their sums", 0.497, 0.504, ends.sum(axis=-1), "reference")
     ends = np.stack([part["starts, K = 5"].a_r[-1], part["starts, K = 5"].a_y[-1]], axis=-1)
-    report.check("  with noise at K = 5 all reach (0.5, 0)", [0.5, 0] * 4, ends.ravel(), 2e-3, "spec 3.4")
+    report.check("  with noise at K = 5 all reach (0.5, 0)", [0.5, 0] * 4, ends.ravel(), 2e-3, "reference")
     fig, (left, right) = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
     for key, label, colour, marker in (("alone", "MRAC only", BLUE, "o"), ("both", "MRAC + estimation", ORANGE, "s")):
         left.loglog(gains, true[key], color=colour, marker=marker, label=f"{label}, feed-forward")
@@ -286,7 +288,7 @@ def loop_choice(report: Report):
 
 
 def loss_of_effectiveness(report: Report):
-    """b_p falls to s b_p at 45 or 15 s, estimation on (spec, 6)."""
+    """b_p falls to s b_p at 45 or 15 s, estimation on (docs/loops/wheel_mrac.md)."""
     scales = [1.0, 0.8, 0.5, 0.2, 0.05]
     expected = {
         45.0: ([259.8, 1009.8, 2294.9, 5643.8], [0.01395, 0.01395, 0.01395, 0.05922], [0, 0, 0, 0.16]),
@@ -299,17 +301,17 @@ def loss_of_effectiveness(report: Report):
         here = jax.tree.map(lambda a, i=i: a[times >= onset, 5 * i : 5 * i + 5], log)  # noqa: B023
         since = times[times >= onset] - onset
         name = f"b_p falls to 0.8, 0.5, 0.2, 0.05 at {onset:g} s"
-        report.relative(f"{name}: residual", residuals, peak(here.residual)[1:], 0.02, "spec 6 [deg/s]")
-        report.relative("  max true error", errors, peak(here.error)[1:], 0.02, "spec 6 [deg]")
+        report.relative(f"{name}: residual", residuals, peak(here.residual)[1:], 0.02, "reference [deg/s]")
+        report.relative("  max true error", errors, peak(here.error)[1:], 0.02, "reference [deg]")
         outside = np.abs(here.error) > 0.05
         last = [since[o][-1] if o.any() else 0.0 for o in outside.T[1:]]
-        report.check("  settled to 0.05 deg after", settling, last, 0.011, "spec 6 [s]")
+        report.check("  settled to 0.05 deg after", settling, last, 0.011, "reference [s]")
         delays = [since[a][0] if a.any() else np.inf for a in here.alarm.T]
-        report.check("  alarm after", [0.02] * 4, delays[1:], 1e-9, "spec 6 [s]")
-        report.check("  alarms without a fault", 0, int(here.alarm[:, 0].sum()), 0, "spec 6")
+        report.check("  alarm after", [0.02] * 4, delays[1:], 1e-9, "reference [s]")
+        report.check("  alarms without a fault", 0, int(here.alarm[:, 0].sum()), 0, "reference")
         sums = (here.a_r + here.a_y)[-1]
-        report.relative("  effectiveness 0.5 / (a_r + a_y) at the end", scales, 0.5 / sums, 0.02, "spec 6: DC gain")
-        report.relative("  a_r + a_y at the end", [0.62660, 0.99985, 2.4942, 9.9702], sums[1:], 0.02, "spec 6")
+        report.relative("  effectiveness 0.5 / (a_r + a_y) at the end", scales, 0.5 / sums, 0.02, "reference: DC gain")
+        report.relative("  a_r + a_y at the end", [0.62660, 0.99985, 2.4942, 9.9702], sums[1:], 0.02, "reference")
         for s, residual, colour in zip(scales[1:], here.residual.T[1:], (BLUE, ORANGE, GREEN, PINK)):
             axes[i].semilogy(since[:126], np.abs(residual[:126]), color=colour, lw=1, label=f"$s$ = {s:g}")
         axes[i].axhline(50, color=GREY, lw=0.8)
@@ -322,7 +324,7 @@ def loss_of_effectiveness(report: Report):
 
 
 def friction_growth(report: Report):
-    """Friction appears at 60 s; sampled law, estimation on (spec, 6)."""
+    """Friction appears at 60 s; sampled law, estimation on (docs/loops/wheel_mrac.md)."""
     sizes = [1e4, 3e4, 1e5, 3e5]
     params = wm.hardware_params._replace(J_hat=5.0, ope=1.0)
     pairs = [
@@ -333,9 +335,9 @@ def friction_growth(report: Report):
     late = times >= 60
     delays = np.argmax(log.alarm[late], axis=0) * wm.DT
     report.relative(
-        "friction 1e4 ... 3e5 at 60 s: alarm after", [15.38, 13.74, 12.38, 11.38], delays, 0.02, "spec 6 [s]"
+        "friction 1e4 ... 3e5 at 60 s: alarm after", [15.38, 13.74, 12.38, 11.38], delays, 0.02, "reference [s]"
     )
-    report.relative("  max error", [0.082, 0.205, 0.473, 0.667], peak(log.error[late]), 0.02, "spec 6 [deg]")
+    report.relative("  max error", [0.082, 0.205, 0.473, 0.667], peak(log.error[late]), 0.02, "reference [deg]")
 
 
 def large_sweep(report: Report):
@@ -381,15 +383,15 @@ def large_sweep(report: Report):
         q = np.percentile(got.peak_ill[on], [50, 95])
         report.note(f"{name}: max true error after the fault, median {q[0]:.3f}, 95 % below {q[1]:.3f} deg")
     close = np.mean(np.abs(got.J_hat / scenarios.J_z - 1)[estimating] < 0.005)
-    report.within("  J_hat within 0.5 % at the end, share", 0.99, None, close, "spec 2, Fig. 8b")
+    report.within("  J_hat within 0.5 % at the end, share", 0.99, None, close, "reference, Fig. 8b")
     report.note(
         f"estimation: J_hat stays within 0.5 % of J_z after {np.median(got.J_settling[estimating]):.1f} s (median)"
     )
-    # e_ss = |J_z / J_hat - 1| rate / K (spec, 3.2): without friction, loss or estimation it is the peak error
+    # e_ss = |J_z / J_hat - 1| rate / K (docs/loops/wheel_mrac.md): without friction, loss or estimation it is the peak error
     law = mismatch * 2.5339183 / params.K
     clear = ~estimating & (scenarios.wheel.friction < 3e3) & (scenarios.drive.scale > 0.8) & (law > 0.3)
     report.within("  peak error over |J_z/J_hat - 1| rate/K, median", 0.95, 1.05,
-                  np.median(got.peak[clear] / law[clear]), "spec 3.2")  # fmt: skip
+                  np.median(got.peak[clear] / law[clear]), "reference")  # fmt: skip
     caught = np.isfinite(got.delay)
     fig, (left, right) = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
     left.loglog(law[~estimating], got.peak[~estimating], ".", ms=2, color=BLUE, alpha=0.4, label="MRAC only")
@@ -422,7 +424,7 @@ def tuning(report: Report):
         drive = scenarios.drive._replace(onset=rng.uniform(12, 80, n), scale=rng.choice([1.0, 0.8, 0.5, 0.2], n))
         return scenarios._replace(J_z=rng.uniform(4.5, 6.5, n), drive=drive)
 
-    def score(params, scenario, now, log):  # spec, 7
+    def score(params, scenario, now, log):  # reference
         return scores.mean(log.error**2 + 1e-8 * log.step**2), scores.mean(log.error**2), scores.mean(log.step**2)
 
     def shipped(theta):

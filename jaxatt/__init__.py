@@ -7,7 +7,8 @@ Published loops are in `jaxatt.systems`; parts to build one's own are in the mod
 from jaxatt.attitude import mrp_error, mrp_rate
 from jaxatt.engine import Now, System, every, fast_cpu, noise_of, rk4, simulate, vmapped
 from jaxatt.faults import Fault, Reading, dead, on_axes
-from jaxatt.study import rerun, sweep, tune
+from jaxatt.study import rerun, sweep
+from jaxatt.tuning import tune
 from jaxatt.vec import Mat3, Quat, Vec3
 
 __all__ = [

@@ -14,7 +14,7 @@ def body_acceleration(w: Vec3, u: Vec3, J: Mat3, J_inv: Mat3, sign=-1) -> Vec3:
     """dw/dt [rad/s^2] of a rigid body under torque u [N m]: J w' = -w x J w + u.
 
     sign: -1 is Euler's equation; +1 the dynamics as Yun & Kang (2020), eq. (4), print them, which do not
-    conserve momentum (spec, 5.1).
+    conserve momentum (docs/loops/observer_pd.md, erratum 1).
     """
     return J_inv @ once(lambda w, u: sign * cross(w, J @ w) + u, w, u)
 
@@ -41,7 +41,7 @@ class Wheel(NamedTuple):
 
 
 def wheel_acceleration(wheel: Wheel, y, u):
-    """dy/dt [deg/s^2] of a wheel at speed y under the command u (spec, 4).
+    """dy/dt [deg/s^2] of a wheel at speed y under the command u (docs/loops/wheel_mrac.md, choice 7).
 
     y' = -a y + b u - F exp(-(y / y_s)^2) tanh(y / eps), where u has passed the bound, the dead zone and the gate.
     Continuous in y and u, so that gradients exist; the gate rises over a tenth of its width.
@@ -78,7 +78,7 @@ def wheeled_acceleration(w: Vec3, H: Vec3, T: Vec3, J: Mat3, J_inv: Mat3) -> Vec
 def wheel_rate(u, h, torque_max, momentum_max):
     """What the wheels make of the commanded momentum rate u: limited, and none outward past momentum_max.
 
-    u, h: (n, *lanes) commanded rate and momentum; limits of shape (*lanes), inf for none.
+    u, h: (n, *lanes) commanded rate and momentum; torque_max, momentum_max: limits of shape (*lanes), inf for none.
     """
     limited = jnp.clip(u, -torque_max, torque_max)
     full = jnp.abs(h) >= momentum_max
@@ -89,12 +89,12 @@ def wheel_rate(u, h, torque_max, momentum_max):
 
 
 class ModuleInertia(NamedTuple):
-    """Moments of inertia of one module, the same for all of a cluster; shape (*lanes), [kg m^2]."""
+    """Moments of inertia of one module, the same for all of a cluster; shape (*lanes)."""
 
-    I_cr: Any  # of the whole module about its gimbal axis r
-    I_cs: Any  # of the whole module about its spin axis s
-    I_ct: Any  # of the whole module about its torque axis t
-    I_ws: Any  # of the wheel about its spin axis
+    I_cr: Any  # [kg m^2] of the whole module about its gimbal axis r
+    I_cs: Any  # [kg m^2] of the whole module about its spin axis s
+    I_ct: Any  # [kg m^2] of the whole module about its torque axis t
+    I_ws: Any  # [kg m^2] of the wheel about its spin axis
 
 
 class CmgMotion(NamedTuple):
@@ -113,7 +113,7 @@ def cluster_inertia(J: Mat3, at: Triads, m: ModuleInertia) -> Mat3:
 
 
 def cluster_momentum(w: Vec3, rate, spin, at: Triads, J_T: Mat3, m: ModuleInertia) -> Vec3:
-    """h_T of eq. (11) [N m s] at gimbal rates and wheel speeds of shape (n, *lanes) [rad/s]."""
+    """h_T of eq. (11) [N m s] at gimbal rates ``rate`` and wheel speeds ``spin`` of shape (n, *lanes) [rad/s]."""
     h = J_T @ w
     for r, s, a, b in zip(each_module(at.r), each_module(at.s), rate, spin):
         h += m.I_cr * a * r + m.I_ws * b * s

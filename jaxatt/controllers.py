@@ -18,7 +18,10 @@ def pd(e_q: Vec3, e_w: Vec3, k_q, k_w) -> Vec3:
 
 
 def rate_gain_floor(e_q: Vec3, eps, lambda_max):
-    """h(e_q) [N m s], below which the adaptive rate gain does not fall; Yun & Kang (2020), after eq. (16)."""
+    """h(e_q) [N m s], below which the adaptive rate gain does not fall; Yun & Kang (2020), after eq. (16).
+
+    eps [1/s] of the Lyapunov function; lambda_max: largest principal moment of inertia [kg m^2].
+    """
     return eps * lambda_max / 4 * (3 + 2 * norm(e_q) + 3 * e_q @ e_q) + 1.5
 
 
@@ -26,8 +29,8 @@ def adapted_rate_gain(k_w, e_q: Vec3, e_w: Vec3, eps, lambda_max, dt):
     """The rate gain k_w [N m s] after dt [s] of the adaptation law, Yun & Kang (2020), eq. (19).
 
     k_w' = -c^2 / (2 eps (k_w - h)) while k_w > h is singular at h: explicit steps overshoot it into negative
-    damping (spec, 6). For constant c and h its exact solution is k_w - h = sqrt(s^2 - c^2 dt / eps), which
-    lands on h for every dt.
+    damping. For constant c and h its exact solution is k_w - h = sqrt(s^2 - c^2 dt / eps), which lands on h for every
+    dt (docs/loops/observer_pd.md, choice 5). eps [1/s]; lambda_max: largest principal moment of inertia [kg m^2].
     """
     h = rate_gain_floor(e_q, eps, lambda_max)
     c = eps * lambda_max * norm(e_w) + 1 + e_q @ e_q
@@ -46,7 +49,7 @@ def saturated(u: Vec3, u_max) -> Vec3:
 class Adaptation(NamedTuple):
     """Numbers of the adaptation law (6) of Eun et al. (2016); the defaults leave it as it is. Shapes (*lanes).
 
-    Speeds are in deg/s. A gain given for rad/s is (pi / 180)^2 times as large here (spec, 3.1).
+    Speeds are in deg/s. A gain given for rad/s is (pi / 180)^2 times as large here: docs/loops/wheel_mrac.md, choice 1.
     """
 
     gamma: Any = 1e-6  # [s/deg^2] adaptation gain
@@ -86,7 +89,8 @@ def mrac_flow(mrac: Mrac, law: Adaptation, r, y, a_m, b_m) -> Mrac:
 def mrac_step(mrac: Mrac, law: Adaptation, r, y, dt) -> Mrac:
     """The parameters after one forward-Euler step of the adaptation (6) over dt [s]; y_m is left alone.
 
-    This is how a computer samples the law; it is stable only within `mrac_sampled_bound`.
+    r: reference input, y: plant output [deg/s]. This is how a computer samples the law; it is stable only within
+    `mrac_sampled_bound`.
     """
     rate = mrac_flow(mrac, law, r, y, 0.0, 0.0)
     a_r, a_y = mrac.a_r + dt * rate.a_r, mrac.a_y + dt * rate.a_y
@@ -94,10 +98,11 @@ def mrac_step(mrac: Mrac, law: Adaptation, r, y, dt) -> Mrac:
 
 
 def mrac_sampled_bound(law: Adaptation, dt, a_p, b_p, a_y=0.0):
-    """The largest r^2 + y^2 [deg^2/s^2] at which `mrac_step` with a held command is stable (spec, 3.5).
+    """The largest r^2 + y^2 [deg^2/s^2] at which `mrac_step` with a held command is stable.
 
     Near the matching line the sampled loop is stable if r^2 + y^2 < (a_p / b_p - a_y) / (gamma dt); normalisation
-    makes gamma smaller by 1 + c (r^2 + y^2), and no bound remains once c is large enough.
+    makes gamma smaller by 1 + c (r^2 + y^2), and no bound remains once c is large enough
+    (docs/loops/wheel_mrac.md, choice 5).
     """
     room = (a_p / jnp.abs(b_p) - law.sign * a_y) / dt
     slack = law.gamma - room * law.normalise
@@ -114,7 +119,8 @@ def _projected(a, rate, limit):
 def pid(angle: Vec3, integral: Vec3, w: Vec3, k_f: Vec3, k_p: Vec3, k_i: Vec3, k_d: Vec3) -> Vec3:
     """T = K_F (K_P angle + K_I integral + K_D w) per axis, Park (2005), eq. (5): a momentum rate of the wheels.
 
-    angle [rad], integral [rad s], w [rad/s]; with degrees the published gains are unstable (spec, 1).
+    angle [rad], integral [rad s], w [rad/s]; with degrees the published gains are unstable (docs/loops/gyro_ekf.md,
+    choice 1).
     """
     law = lambda f, p, i, d, a, s, r: f * (p * a + i * s + d * r)
     return Vec3(*map(law, k_f, k_p, k_i, k_d, angle, integral, w))
@@ -169,7 +175,7 @@ def steer(law: Steering, a: Vec3, axes: GimbalAxes, gamma, healthy, t):
 
 
 def damping(law: Steering, T: Vec3, t) -> Mat3:
-    """lam E of the (generalised) singularity-robust inverse; E = 1 without dither."""
+    """lam E of the (generalised) singularity-robust inverse at time t [s]; E = 1 without dither."""
     lam = law.lam0 * jnp.exp(-law.mu * gram_determinant(T))
     x, y, z = (law.dither * lam * jnp.sin(law.dither_rate * t + phase) for phase in (0, jnp.pi / 2, jnp.pi))
     return Mat3(Vec3(lam, z, y), Vec3(z, lam, x), Vec3(y, x, lam))

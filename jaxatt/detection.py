@@ -1,7 +1,8 @@
 """Detection: from residuals to alarms, from alarms to a cause, and how good a detector is.
 
 Time leads, lanes trail. An evaluation is any number that is large when something is wrong; here mostly
-J = r' M^-1 r, chi-square with as many degrees of freedom as the residual has where the filter is consistent.
+J = r' M^-1 r, chi-square with as many degrees of freedom as the residual has where the filter is consistent. Values
+of it in healthy and in faulty runs are called healthy and faulty.
 """
 
 from __future__ import annotations
@@ -24,9 +25,9 @@ CAUSES = ("none", "first sensor", "second sensor", "common to both")
 
 @door
 def windowed(evaluation, n: int):
-    """Sum of the last n values at every time, Yuan et al., eq. (18); fewer where fewer were seen. Shape (T, *lanes).
+    """Sum of the evaluation's last n values at every time, Yuan et al., eq. (18); fewer where fewer were seen.
 
-    Raises ValueError for n < 1.
+    Shapes (T, *lanes). Raises ValueError for n < 1.
     """
     n = check.whole("n", n)
     a = jnp.asarray(evaluation)
@@ -87,14 +88,18 @@ def alarm(evaluation, threshold):
 def isolate(first, second):
     """The cause that the alarms of two residual generators point to, eq. (20): one of `NONE` ... `COMMON`.
 
-    One alarm blames its own sensor; both blame what the two share, the gyro (not in the paper).
+    first, second: their alarms, bool (*lanes). One alarm blames its own sensor; both blame what the two share, the gyro
+    (docs/loops/star_isolation.md, choice 3).
     """
     return jnp.where(first & second, COMMON, jnp.where(first, FIRST, jnp.where(second, SECOND, NONE)))
 
 
 @door
 def isolate_first(first, second, patience):
-    """The cause from the times [s] of first alarm, inf for never, when the verdict waits patience [s] for the other."""
+    """The cause when the verdict waits patience [s] for the other alarm.
+
+    first, second: times [s] of first alarm of the two residual generators, inf for never, (*lanes).
+    """
     seen = jnp.minimum(first, second)
     return isolate(jnp.isfinite(first) & (first <= seen + patience), jnp.isfinite(second) & (second <= seen + patience))
 
@@ -112,7 +117,7 @@ class Roc(NamedTuple):
 
 @door
 def roc(healthy, faulty, thresholds=None) -> Roc:
-    """The ROC curve of values of an evaluation with and without fault, each flattened.
+    """The ROC curve of values of an evaluation without fault, healthy, and with it, faulty, each flattened.
 
     thresholds: where to take it; None takes every value that occurs. A run that alarms at least once in a window is
     described by its largest value there.
@@ -127,7 +132,7 @@ def roc(healthy, faulty, thresholds=None) -> Roc:
 
 @door
 def detection_at(healthy, faulty, false_alarm) -> float:
-    """The detection rate at the lowest threshold whose false-alarm rate does not exceed false_alarm."""
+    """The detection rate (faulty) at the lowest threshold whose false-alarm rate (healthy) is at most false_alarm."""
     healthy = np.sort(np.ravel(healthy))
     allowed = int(np.floor(false_alarm * len(healthy) + 1e-9))
     threshold = healthy[len(healthy) - 1 - allowed] if allowed < len(healthy) else -np.inf
@@ -144,27 +149,42 @@ def area(curve: Roc) -> float:
 
 @door
 def first_alarm(alarms, t, since=0.0):
-    """Time [s] from since to the first alarm not before it, inf if never: shape (*lanes) from alarms (T, *lanes)."""
+    """Time [s] from since to the first alarm not before it, inf if never, (*lanes).
+
+    alarms: bool (T, *lanes), at the times t [s], (T,).
+    """
     t = jnp.asarray(t).reshape(-1, *(1,) * (jnp.ndim(alarms) - 1))
     return jnp.min(jnp.where(alarms & (t >= since), t - since, jnp.inf), axis=0)
 
 
 @door
 def detected_by(delays, times):
-    """Share of runs detected within each of the times [s]: the distribution of the delay; never is inf."""
+    """Share of runs detected within each of the times [s]: the distribution of delays [s], (runs,), inf for never."""
     delays = np.sort(np.ravel(delays))
     return np.searchsorted(delays, np.asarray(times), side="right") / len(delays)
 
 
 @door
 def chance(false_alarm, samples):
-    """Probability of at least one alarm in so many independent healthy samples: what a detection is worth against."""
+    """Probability of an alarm in so many independent healthy samples, false_alarm being that of one.
+
+    What a detection is worth against.
+    """
     return -jnp.expm1(samples * jnp.log1p(-jnp.asarray(false_alarm, float)))
 
 
 @door
+def interval(successes: int, trials: int, z: float = 1.959964) -> tuple[float, float]:
+    """Wilson's confidence interval of a share, 95 % by default; z: standard deviations on either side."""
+    p, n = successes / trials, trials
+    centre = (p + z * z / (2 * n)) / (1 + z * z / n)
+    half = z / (1 + z * z / n) * float(np.sqrt(p * (1 - p) / n + z * z / (4 * n * n)))
+    return max(0.0, centre - half), min(1.0, centre + half)
+
+
+@door
 def confusion(truth, verdict, causes: int = len(CAUSES)):
-    """Counts, shape (causes, causes): row what was wrong, column what was blamed."""
+    """Counts of runs, shape (causes, causes): row what was wrong, ``truth``, column what was blamed, ``verdict``."""
     table = np.zeros((causes, causes), int)
     np.add.at(table, (np.ravel(truth).astype(int), np.ravel(verdict).astype(int)), 1)
     return table
@@ -175,7 +195,7 @@ def confusion(truth, verdict, causes: int = len(CAUSES)):
 
 @door
 def soft_windowed(evaluation, n, longest: int):
-    """`windowed` with a window of real length n in [1, longest]: its oldest value counts in part. Shape (T, *lanes)."""
+    """`windowed` evaluation, (T, *lanes), by a window of real length n in [1, longest]: the oldest counts in part."""
     a = jnp.asarray(evaluation)
     weights = jnp.clip(n - jnp.arange(longest), 0, 1)
     padded = jnp.concatenate([jnp.zeros((longest - 1, *a.shape[1:]), a.dtype), a])
@@ -184,13 +204,13 @@ def soft_windowed(evaluation, n, longest: int):
 
 @door
 def soft_alarm(evaluation, threshold, temperature):
-    """A probability of alarm in place of a step at the threshold; the step is its limit for temperature -> 0."""
+    """A probability of alarm in place of a step of the evaluation at the threshold, its limit for temperature -> 0."""
     return jax.nn.sigmoid((evaluation - threshold) / temperature)
 
 
 @door
 def soft_delay(probability, dt):
-    """Expected time [s] to the first alarm, sum_k prod_{j<k} (1 - p_j) dt; at most T dt. Shape (*lanes)."""
+    """Expected time [s] to the first alarm, sum_k prod_{j<k} (1 - p_j) dt; at most T dt. probability p: (T, *lanes)."""
     silent = jnp.cumprod(1 - probability, axis=0)
     return dt * (1 + jnp.sum(silent[:-1], axis=0))
 
@@ -200,13 +220,13 @@ def soft_delay(probability, dt):
 
 @door
 def smoothed(mean, value, memory):
-    """The moving mean of normalised innovations after one more; memory in (0, 1], 1 for no memory."""
+    """The moving mean of normalised innovations after one more, ``value``; memory in (0, 1], 1 for no memory."""
     return mean + memory * (value - mean)
 
 
 @door
 def chi_square(mean, memory):
-    """Square of a `smoothed` mean of unit white noise over its variance: chi-square with one degree of freedom."""
+    """Square of a mean of unit white noise, `smoothed` with this memory, over its variance: chi-square, one degree."""
     return mean * mean * (2 - memory) / memory
 
 

@@ -71,8 +71,11 @@ def every(k: int, now: Now, run: Callable, held):
     return jax.lax.cond(now.k % k == 0, run, lambda: held)
 
 
-def _like(tree, example, what: str):
-    """tree with the shapes and dtypes of example, so that a scan can carry it."""
+def like(tree, example, what: str):
+    """tree with the shapes and dtypes of example, so that a scan can carry it; what: the function that made it.
+
+    Raises TypeError where its structure, type or shape cannot be those of the example.
+    """
     if jax.tree.structure(tree) != jax.tree.structure(example):
         raise TypeError(
             f"`{what}` must return the structure {jax.tree.structure(example)}, but it is {jax.tree.structure(tree)}."
@@ -107,11 +110,11 @@ def _step(system: System, params, scenario, k, state, noise):
     dtype = check.float_type((params, scenario))
     now = Now(k, k.astype(dtype) * system.dt, system.dt)
     x, z, log = system.tick(params, scenario, now, *state, noise)
-    x, z = _like((x, z), state, "tick")
+    x, z = like((x, z), state, "tick")
     h = system.dt / system.substeps
 
     def flow(t, x):
-        return once(lambda t, x: _like(system.flow(params, scenario, t, x, z), x, "flow"), t, x)
+        return once(lambda t, x: like(system.flow(params, scenario, t, x, z), x, "flow"), t, x)
 
     if system.substeps == 1:
         x = rk4(flow, now.t, x, h)
@@ -368,6 +371,17 @@ def block_log(system: System, ticks: int, params, scenarios, key, block, lane):
 
     _, logs = _run(system, params, scenarios, 1, ticks, CHUNK, noise, fold, None)
     return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:ticks], logs)
+
+
+def block_records(system: System, record: Callable, ticks: int, every: int, params, scenarios, key, block):
+    """record(log) of the ticks 0, every, 2 every, ... of a block: a tree of shape (records, ..., BLOCK)."""
+    noise = partial(_block_noise, system, _block_key(key, block), check.float_type((params, scenarios)))
+
+    def fold(none, now, log):
+        return none, jax.tree.map(lambda a: jnp.broadcast_to(a, _lane_shape(jnp.shape(a))), record(log))
+
+    _, logs = _run(system, params, scenarios, 1, ticks, CHUNK, noise, fold, None)
+    return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:ticks:every], logs)
 
 
 class _Lanes(NamedTuple):

@@ -23,8 +23,8 @@ def mrp_observer(
     """Rate of change of the nonlinear MRP observer's estimate, Yun & Kang (2020), eq. (7).
 
     y: readings; u: torque [N m]; J: inertia [kg m^2]; alpha [1/s], beta [N m s]: gains; sign: -1 for Euler's
-    equation, +1 for the dynamics as printed (spec, 5.1). Eq. (6) prints S(w) J wh in place of S(wh) J w, for
-    which the Lyapunov identity fails (spec, 5.2).
+    equation, +1 for the dynamics as printed. Eq. (6) prints S(w) J wh in place of S(wh) J w, for which the Lyapunov
+    identity fails. Errata 1 and 2 of docs/loops/observer_pd.md.
     """
     xi_q, xi_w = y.q - estimate.q, y.w - estimate.w
 
@@ -43,7 +43,7 @@ def residual_norm(y: AttitudeRate, estimate: AttitudeRate):
 class LeastSquares(NamedTuple):
     """An estimate of a in y = W a and its gain. Shapes (*lanes)."""
 
-    a: Any  # estimate of the parameter
+    a: Any  # [y / W] estimate of the parameter
     P: Any  # [1/(W^2 s)] gain
 
 
@@ -51,9 +51,9 @@ def least_squares(estimate: LeastSquares, W, y, dt, forget=0.0) -> LeastSquares:
     """The estimate after dt [s] in which the regressor W and the output y were constant.
 
     Eun et al. (2016), eqs. (9), (10): a' = -P W (W a - y), P' = -P W^2 P, here in the rational form that is their
-    exact solution, stable for every dt and never P < 0; forward Euler makes P negative once P W^2 dt > 1 (spec,
-    3.5). forget [1/s]: rate at which old data lose weight; without excitation P then grows without bound, and
-    the caller limits it.
+    exact solution, stable for every dt and never P < 0; forward Euler makes P negative once P W^2 dt > 1
+    (docs/loops/wheel_mrac.md, choice 4). forget [1/s]: rate at which old data lose weight; without excitation P then
+    grows without bound, and the caller limits it.
     """
     P = estimate.P / (jnp.exp(-forget * dt) + estimate.P * W * W * dt)
     return LeastSquares(a=estimate.a - P * W * (W * estimate.a - y) * dt, P=P)

@@ -47,7 +47,7 @@ class Reading(NamedTuple):
 
 
 def dead(onset=0.0, end=jnp.inf) -> Fault:
-    """A channel that reads exactly zero."""
+    """A channel that reads exactly zero from onset to end [s]."""
     return Fault(onset, end, scale=0.0, growth=0.0)
 
 
@@ -70,7 +70,7 @@ def any_active(faults, t):
 
 @door
 def first_onset(faults):
-    """The earliest onset [s] of a sequence of `Fault`; inf where there is none."""
+    """The earliest onset [s] of faults, a sequence of `Fault`; inf where there is none."""
     return reduce(jnp.minimum, [f.onset for f in faults])
 
 

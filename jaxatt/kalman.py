@@ -67,7 +67,8 @@ def ekf_predict(belief: Belief, f: Callable, steady, Q, dt) -> Belief:
 def innovation(belief: Belief, value, h: Callable, R):
     """Residual value - h(mean) and its variance, both (k, *lanes), each measurement for itself.
 
-    h: a linear map that takes components in the leading axis, of a mean and of a covariance alike.
+    h: a linear map that takes components in the leading axis, of a mean and of a covariance alike; R: (k,) or
+    (k, *lanes) variances of the measurements.
     """
     rows = h(belief.cov)
     variance = jax.lax.map(lambda ir: h(ir[1])[ir[0]], (jnp.arange(rows.shape[0]), rows))
@@ -118,7 +119,7 @@ def kalman_update(belief: Belief, y: Reading, h: Callable, R) -> tuple[Belief, E
 def nees(belief: Belief, truth):
     """Normalised estimation error squared e' P^-1 e, shape (*lanes); chi-square with n degrees of freedom.
 
-    It is the NIS of the whole state measured without noise, and needs no solver.
+    truth: the state, (n, *lanes). It is the NIS of the whole state measured without noise, and needs no solver.
     """
     e = jnp.broadcast_to(truth - belief.mean, belief.mean.shape)
     at_zero = Belief(jnp.zeros_like(e), belief.cov)

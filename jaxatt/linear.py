@@ -42,7 +42,7 @@ def sampled(system: System, params, scenario, *, ticks: int, states: tuple[str, 
 
 @door
 def growth_rates(matrix, period: float) -> np.ndarray:
-    """Growth rates log|z| / period [1/s] of a sampled loop's modes, largest first, shape (..., n).
+    """Growth rates log|z| / period [1/s] of a sampled loop's modes, largest first, shape (..., n); matrix (..., n, n).
 
     All negative: the loop converges, the slowest mode with the time constant -1 / rate.
     """

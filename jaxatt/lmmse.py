@@ -25,7 +25,7 @@ class Innovation(NamedTuple):
 
 
 def symmetric(rows):
-    """A symmetric matrix by its upper triangle: what rounding did to the lower one is dropped, and not computed."""
+    """A symmetric matrix, given by rows, by its upper triangle: what rounding did to the lower one is not computed."""
     n = range(len(rows))
     return tuple(tuple(rows[min(i, j)][max(i, j)] for j in n) for i in n)
 
@@ -100,8 +100,8 @@ class AttitudeBias(NamedTuple):
 class Estimate(NamedTuple):
     """A state and its error covariance."""
 
-    x: Any  # n components
-    P: Any  # n rows of n
+    x: Any  # n components of shape (*lanes)
+    P: Any  # n rows of n, shape (*lanes) each
 
 
 def quaternion_step(x: Quat, w: Vec3, w_r: Vec3, dt) -> Quat:
@@ -134,7 +134,7 @@ def noise_moment(law, x, P, Q):
 
     law: 0 second moment of the state, as the LMMSE filter has it, eq. (11); 1 at the estimate and 2 at the
     identity, which make the noise additive; 3 the second moment of the estimate, Q - P, right where the true rate
-    and not the gyro's is given (spec, 7).
+    and not the gyro's is given (docs/loops/star_isolation.md, choice 5).
     """
     xx = outer(x)
 
@@ -155,7 +155,8 @@ def lmmse_predict(e: Moments, w: Vec3, w_r: Vec3, std, dt, law=0.0) -> Moments:
     """Prediction over dt [s] with the gyro's reading w [rad/s] at its start; (11), (13), (15).
 
     w_r: rate of the reference frame; std: standard deviation of the gyro's noise [rad/s] per sample; law: see
-    `noise_moment`. Eq. (14) prints A(k), which must be A(k-1) (spec, 9.1).
+    `noise_moment`. Eq. (14) prints A(k), which must be A(k-1) (docs/loops/star_isolation.md,
+    erratum 1).
     """
     A = lambda x: quaternion_step(Quat(*x), w, w_r, dt)
     W = rate_noise(noise_moment(law, e.x, e.P, e.Q), std, dt)
@@ -175,8 +176,8 @@ def lmmse_update(e: Moments, y: Vec3, s: Vec3, std) -> tuple[Moments, Innovation
 def bias_predict(e: Estimate, w: Vec3, w_r: Vec3, std, walk, dt) -> Estimate:
     """Prediction of `AttitudeBias` over dt [s]: `lmmse_predict` about the reading less the estimated bias.
 
-    walk: standard deviation of the bias's random walk [rad/s/sqrt(s)]. The second moment of the quaternion is
-    taken as P + x x', for with a bias its own recursion is not closed.
+    std: of the gyro's noise [rad/s] per sample; walk: of the bias's random walk [rad/s/sqrt(s)]. The second moment of
+    the quaternion is taken as P + x x', for with a bias its own recursion is not closed.
     """
     x = e.x
     rate = w - x.b
@@ -194,7 +195,7 @@ def bias_predict(e: Estimate, w: Vec3, w_r: Vec3, std, walk, dt) -> Estimate:
 
 
 def bias_update(e: Estimate, y: Vec3, s: Vec3, std) -> tuple[Estimate, Innovation]:
-    """Update of `AttitudeBias` by the reading of a star, as `lmmse_update`."""
+    """Update of `AttitudeBias` by the reading of a star with noise std [1], as `lmmse_update`."""
     C = lambda x: star_map(x, s)
     x, P, innovation = update_three(e.x, e.P, y, C, C(e.x), std * std)
     return Estimate(x, P), innovation
@@ -203,7 +204,7 @@ def bias_update(e: Estimate, y: Vec3, s: Vec3, std) -> tuple[Estimate, Innovatio
 def turn_predict(e: Estimate, w: Vec3, w_r: Vec3, std, dt) -> Estimate:
     """Prediction of a multiplicative EKF: x a unit `Quat`, P of the small turn a in q = x exp(a / 2), 3 rows.
 
-    Exact for rates that are constant over dt: no small angle is assumed.
+    Exact for rates that are constant over dt: no small angle is assumed. std: of the gyro's noise [rad/s] per sample.
     """
     ahead = quat_from_vector(dt * w)
     x = quat_conjugate(quat_from_vector(dt * w_r)) * e.x * ahead
@@ -213,7 +214,10 @@ def turn_predict(e: Estimate, w: Vec3, w_r: Vec3, std, dt) -> Estimate:
 
 
 def turn_update(e: Estimate, y: Vec3, s: Vec3, std) -> tuple[Estimate, Innovation]:
-    """Update of a multiplicative EKF by the reading y of a star in direction s, with the exact residual y - A(x) s."""
+    """Update of a multiplicative EKF by the reading y of a star in direction s, with the exact residual y - A(x) s.
+
+    std: of the noise of each component [1].
+    """
     h = quat_rotate(quat_conjugate(e.x), s)
     o = jnp.zeros_like(e.x.x)
     turn, P, innovation = update_three(Vec3(o, o, o), e.P, y, lambda a: cross(h, Vec3(*a)), h, std * std)

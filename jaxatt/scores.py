@@ -2,7 +2,8 @@
 
 A score is one pure function (params, scenario, now, log) -> tree of tallies. The tally of a whole run is the
 sum of those of its ticks, and `values` turns the sum into numbers. The defaults of a tally's fields are those
-of an empty run. A NaN in the log stays visible: means, extremes and final values become NaN, `always` False.
+of an empty run. A NaN in the log stays visible: means, extremes and final values become NaN, `always` False. value,
+condition: numbers of the tick, shape (*lanes); inside: bool, whether the tick lies in the window.
 """
 
 from __future__ import annotations
@@ -19,8 +20,8 @@ from jaxatt.vec import safe_sqrt
 class Mean(NamedTuple):
     """Mean over the ticks of a window; NaN if it held none."""
 
-    total: Any = 0.0
-    ticks: Any = 0.0
+    total: Any = 0.0  # (*lanes) sum so far
+    ticks: Any = 0.0  # (*lanes) number of ticks in it
 
     def __add__(self, later):
         return Mean(self.total + later.total, self.ticks + later.ticks)
@@ -33,8 +34,8 @@ class Mean(NamedTuple):
 class Rms(NamedTuple):
     """Root mean square over the ticks of a window; NaN if it held none."""
 
-    total: Any = 0.0
-    ticks: Any = 0.0
+    total: Any = 0.0  # (*lanes) sum of squares so far
+    ticks: Any = 0.0  # (*lanes) number of ticks in it
 
     def __add__(self, later):
         return Rms(self.total + later.total, self.ticks + later.ticks)
@@ -46,7 +47,7 @@ class Rms(NamedTuple):
 class Peak(NamedTuple):
     """Largest value in a window; NaN if it held no tick."""
 
-    largest: Any = -jnp.inf
+    largest: Any = -jnp.inf  # (*lanes)
 
     def __add__(self, later):
         return Peak(jnp.maximum(self.largest, later.largest))
@@ -58,7 +59,7 @@ class Peak(NamedTuple):
 class First(NamedTuple):
     """First time [s] at which something held; inf if never."""
 
-    t: Any = jnp.inf
+    t: Any = jnp.inf  # (*lanes) [s]
 
     def __add__(self, later):
         return First(jnp.minimum(self.t, later.t))
@@ -70,8 +71,8 @@ class First(NamedTuple):
 class Settling(NamedTuple):
     """Last time [s] outside a band in a window; 0 if never, inf if still outside at its end, NaN if it held no tick."""
 
-    outside: Any = -jnp.inf
-    end: Any = -jnp.inf
+    outside: Any = -jnp.inf  # (*lanes) [s] last time outside
+    end: Any = -jnp.inf  # (*lanes) [s] last time in the window
 
     def __add__(self, later):
         return Settling(jnp.maximum(self.outside, later.outside), jnp.maximum(self.end, later.end))
@@ -84,7 +85,7 @@ class Settling(NamedTuple):
 class Always(NamedTuple):
     """Whether something held at every tick."""
 
-    held: Any = True
+    held: Any = True  # (*lanes) bool
 
     def __add__(self, later):
         return Always(self.held & later.held)
@@ -96,7 +97,7 @@ class Always(NamedTuple):
 class Final(NamedTuple):
     """Value at the last tick."""
 
-    last: Any = jnp.nan
+    last: Any = jnp.nan  # (*lanes)
 
     def __add__(self, later):
         return later
@@ -118,7 +119,7 @@ def mean(value, inside: Any = True) -> Mean:
 
 @door
 def rms(square, inside: Any = True) -> Rms:
-    """Tally a root mean square; takes the squared value, for instance ``log.q @ log.q``."""
+    """Tally a root mean square where ``inside`` holds; takes the square, for instance ``log.q @ log.q``."""
     return Rms(*mean(square, inside))
 
 
@@ -186,8 +187,8 @@ def values(tree):
 class Span(NamedTuple):
     """Largest minus smallest value in a window; NaN if it held no tick."""
 
-    largest: Any = -jnp.inf
-    smallest: Any = jnp.inf
+    largest: Any = -jnp.inf  # (*lanes)
+    smallest: Any = jnp.inf  # (*lanes)
 
     def __add__(self, later):
         return Span(jnp.maximum(self.largest, later.largest), jnp.minimum(self.smallest, later.smallest))
@@ -208,7 +209,7 @@ def span(value, inside: Any = True) -> Span:
 class Total(NamedTuple):
     """Sum over the ticks of a window; 0 if it held none."""
 
-    total: Any = 0.0
+    total: Any = 0.0  # (*lanes) sum so far
 
     def __add__(self, later):
         return Total(self.total + later.total)
@@ -220,8 +221,8 @@ class Total(NamedTuple):
 class PeakTime(NamedTuple):
     """Time [s] of the first largest value; NaN if there was no tick."""
 
-    largest: Any = -jnp.inf
-    t: Any = jnp.nan
+    largest: Any = -jnp.inf  # (*lanes)
+    t: Any = jnp.nan  # (*lanes) [s]
 
     def __add__(self, later):
         higher = later.largest > self.largest
@@ -233,7 +234,7 @@ class PeakTime(NamedTuple):
 
 @door
 def total(value, inside=True) -> Total:
-    """Tally a sum over the ticks where ``inside`` holds."""
+    """Tally the sum of value over the ticks where ``inside`` holds."""
     return Total(_where(inside, jnp.asarray(value, jnp.result_type(value, 1.0)), 0))
 
 

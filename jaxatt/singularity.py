@@ -3,7 +3,7 @@
 T = [t_1 ... t_n] holds the torque directions (`mounting.Triads.t`); the cluster is singular where rank T < 3.
 Everything about T is closed-form 3 x n algebra on `Vec3` of shape (n, *lanes): no decomposition, any lanes. A
 module that does not count has its column set to zero. Momenta are in units of one module's h_w, angles in rad.
-Source: Jin & Leeghim (2021), section 3; the spec's sections 4, 5, 7.
+Source: Jin & Leeghim (2021), section 3; docs/loops/cmg_loss.md.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ def _squares(t: list[Vec3]):
     """sigma_1^2 >= sigma_2^2 >= sigma_3^2 >= 0 of the columns t, the eigenvalues of T T'.
 
     The small root comes from the product of the roots (Vieta), never from a subtraction, and the product from
-    the minors, never from T T' (spec, 4).
+    the minors, never from T T' (docs/loops/cmg_loss.md, choice 3).
     """
     xx, yy, zz = (sum(a * a for a in row) for row in zip(*t))
     trace = xx + yy + zz
@@ -432,7 +432,7 @@ def _area(axes: GimbalAxes, m: int):
 
 @door
 def passability(axes: GimbalAxes, gamma) -> np.ndarray:
-    """Eigenvalues, ascending, shape (n - 2, *lanes), of N' diag(u.s_i) N at singular gimbal angles (n, *lanes).
+    """Eigenvalues, ascending, shape (n - 2, *lanes), of N' diag(u.s_i) N at singular angles gamma (n, *lanes).
 
     N spans the null space of T, u is the singular direction; at rank T = 2. Eigenvalues of one sign: no null motion
     leaves the singular state, it is impassable. Of both signs: perhaps passable. With three modules there is one
@@ -463,8 +463,8 @@ def rearrange(axes: GimbalAxes, gamma, step=np.pi / 36, rank: Callable | None = 
     """All gimbal angles of least condition among gamma and its neighbours by -step, 0, +step [rad] in each module.
 
     axes: (n,) of the modules that work; gamma: (n,). Ties are common, for the clusters are symmetric, and they are
-    not equally good (spec, 5): rank(gamma of shape (k, n)) -> (k,) orders them, least first, for instance by
-    simulation. Ties within 1e-9.
+    not equally good (docs/loops/cmg_loss.md, erratum 9): rank(gamma of shape (k, n)) -> (k,) orders them, least
+    first, for instance by simulation. Ties within 1e-9.
     """
     gamma = np.asarray(gamma, float)
     options = gamma + step * np.array(list(product((-1, 0, 1), repeat=len(gamma))))

@@ -1,4 +1,4 @@
-"""Studies: what one does with a closed loop, in memory: sweep many scenarios, rerun one, tune by gradient."""
+"""Studies: what one does with a closed loop, in memory: sweep many scenarios, rerun one."""
 
 from __future__ import annotations
 
@@ -7,14 +7,11 @@ from collections import deque
 from collections.abc import Callable
 from functools import lru_cache
 from math import prod
-from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
-from jax.flatten_util import ravel_pytree
-from tqdm.auto import tqdm
+from tqdm import tqdm
 
 from jaxatt import check
 from jaxatt.engine import BLOCK, System, admit, block_log, block_scores, compiled, one_key, traced, tree_bytes
@@ -40,30 +37,39 @@ def sweep(system: System, params, scenarios, key, *, ticks: int, score: Callable
     blocks = -(-n // BLOCK)
     if traced(params, scenarios, key):
         return _traced(system, score, ticks, params, scenarios, key, n, blocks)
+    with _bar(progress, n, " scenarios") as bar:
+        return scored(system, params, scenarios, key, ticks, score, advance=bar.update)
+
+
+def scored(system, params, scenarios, key, ticks, score, first: int = 0, advance: Callable = lambda n: None):
+    """What `sweep` gives, of admitted input: the blocks first, first + 1, ... on every local device, one host loop.
+
+    advance(n) is called when n more scenarios are done.
+    """
+    n = check.lanes(scenarios)
+    blocks = -(-n // BLOCK)
     rows, layout = _packed(scenarios)
     run = compiled(_packed_scores, 4)
     devices = jax.local_devices()
     at = [jax.device_put((params, key), device) for device in devices]
     under_way: deque = deque()
     done: list = []
-    with _bar(progress, n, " scenarios") as bar:
-        for block in range(blocks + 2 * len(devices)):
-            if block < blocks:
-                params, key = at[block % len(devices)]  # they decide where it runs
-                under_way.append(
-                    run(system, score, ticks, layout, params, key, _lanes_of(rows, block), np.int32(block))
-                )
-            if under_way and block >= 2 * len(devices) - 1:
-                done.append(jax.tree.map(np.asarray, under_way.popleft()))
-                bar.update(min(BLOCK, n - (len(done) - 1) * BLOCK))
+    for block in range(blocks + 2 * len(devices)):
+        if block < blocks:
+            params, key = at[block % len(devices)]  # they decide where it runs
+            number = np.int32(first + block)
+            under_way.append(run(system, score, ticks, layout, params, key, _lanes_of(rows, block), number))
+        if under_way and block >= 2 * len(devices) - 1:
+            done.append(jax.tree.map(np.asarray, under_way.popleft()))
+            advance(min(BLOCK, n - (len(done) - 1) * BLOCK))
     return jax.tree.map(lambda *parts: np.concatenate(parts, axis=-1)[..., :n], *done)
 
 
-def _bar(progress: bool | None, total: int, unit: str):
-    """A progress bar; progress None: on a terminal or in a notebook, and after two seconds."""
+def _bar(progress: bool | None, total: int, unit: str, done: int = 0):
+    """A progress bar of total units, some done before; progress None: on a terminal or in a notebook, after 2 s."""
     seen = sys.stderr.isatty() or "ipykernel" in sys.modules
     hidden = progress is False or (progress is None and not seen)
-    return tqdm(total=total, unit=unit, disable=hidden, delay=0 if progress else 2, leave=False)
+    return tqdm(total=total, unit=unit, initial=done, disable=hidden, delay=0 if progress else 2, leave=False)
 
 
 def _packed_scores(system, score, ticks, layout, params, key, rows, block):
@@ -126,89 +132,17 @@ def rerun(system: System, params, scenarios, key, index: int, *, ticks: int):
     if index >= n:
         check.refuse("index", f"be less than the {n} scenarios", index)
     params, scenarios = admit(system, params, scenarios, (n,))
+    here = _lanes_of(jax.tree.map(np.asarray, scenarios), index // BLOCK)
+    return logged(system, params, here, one_key(key), index, ticks)
+
+
+def logged(system, params, here, key, index: int, ticks: int):
+    """What `rerun` gives, of admitted input: here are the `BLOCK` scenarios of the block that holds ``index``."""
     block, lane = divmod(index, BLOCK)
-    here = _lanes_of(jax.tree.map(np.asarray, scenarios), block)
-    operands = params, here, one_key(key), np.int32(block), np.int32(lane)
+    operands = params, here, key, np.int32(block), np.int32(lane)
     run = compiled(block_log, 2)
     check.fits_memory(f"`ticks` = {ticks}", tree_bytes(run.eval_shape(system, ticks, *operands)), "ask for fewer")
     return run(system, ticks, *operands)
-
-
-FEW = 6  # numbers up to which forward mode is the cheaper
-
-
-def value_and_gradient(cost: Callable, theta, key):
-    """cost(theta, key), a scalar, and its gradient, a tree like theta.
-
-    Up to `FEW` numbers by forward mode: it costs less than reverse mode there, compiles in a quarter of the time
-    and keeps no history. Pure.
-
-    Raises TypeError if the cost is no scalar.
-    """
-    flat, unravel = ravel_pytree(theta)
-    if jax.eval_shape(cost, theta, key).shape != ():
-        raise TypeError(f"`cost` must be a scalar, but its shape is {jax.eval_shape(cost, theta, key).shape}.")
-    if flat.size > FEW:
-        return jax.value_and_grad(cost)(theta, key)
-    along = lambda direction: jax.jvp(lambda a: cost(unravel(a), key), (flat,), (direction,))
-    value, slopes = jax.vmap(along, out_axes=(None, 0))(jnp.eye(flat.size, dtype=flat.dtype))
-    return value, unravel(slopes)
-
-
-class History(NamedTuple):
-    """What `tune` met, step by step; every leaf leads with the steps."""
-
-    theta: Any  # parameters at which the step was taken
-    cost: Any  # (steps,) their cost
-    gradient: Any  # (steps,) norm of the gradient
-    step: Any  # (steps,) [1] factor on the optimizer's update: below 1 after a step that ended in NaN
-
-
-def tune(cost: Callable, theta, optimizer, steps: int, key, *, progress: bool | None = None) -> tuple[Any, History]:
-    """Minimise cost(theta, key), a scalar, over a pytree theta; returns the best theta met and the `History`.
-
-    Every step sees the same key: with common random numbers the cost is a smooth function and "best" has a
-    meaning. optimizer: any of optax. A step that ends in a cost or gradient that is not finite is taken back:
-    the search goes on from the best theta with updates half as long. Gains that must stay positive are tuned as
-    logarithms.
-
-    Raises ValueError if the cost is not finite at the start or steps < 1, TypeError if it is no scalar.
-    """
-    steps = check.whole("steps", steps)
-    theta = jax.tree.map(lambda a: jnp.asarray(a, jnp.result_type(a, float)), theta)
-
-    def step(theta, state, factor):
-        value, gradient = value_and_gradient(cost, theta, key)
-        size = optax.global_norm(gradient)
-        more = dict(value=value, grad=gradient, value_fn=lambda theta: cost(theta, key)) if line_search else {}
-        updates, state = optimizer.update(gradient, state, theta, **more)
-        updates = jax.tree.map(lambda u: factor * u, updates)
-        return value, size, optax.apply_updates(theta, updates), state
-
-    line_search = isinstance(optimizer, optax.GradientTransformationExtraArgs)
-    step = compiled(step, 0)
-    state, factor = optimizer.init(theta), 1.0
-    best = (np.inf, theta, state)
-    trail = []
-    with _bar(progress, steps, " steps") as bar:
-        for _ in range(steps):
-            value, size, ahead, ahead_state = step(theta, state, factor)
-            value, size = float(value), float(size)
-            trail.append((theta, value, size, factor))
-            if np.isfinite(value) and np.isfinite(size):
-                if value < best[0]:
-                    best = (value, theta, state)
-                theta, state = ahead, ahead_state
-            elif np.isinf(best[0]):
-                check.refuse("cost", "be finite, with a finite gradient, at the start", value)
-            else:
-                _, theta, state = best
-                factor /= 2
-            bar.set_postfix(cost=f"{value:.4g}", refresh=False)
-            bar.update()
-    thetas, values, sizes, factors = zip(*trail)
-    stacked = jax.tree.map(lambda *a: np.stack(a), *thetas)
-    return best[1], History(stacked, np.array(values), np.array(sizes), np.array(factors))
 
 
 @lru_cache
@@ -226,7 +160,7 @@ def varied(system: System) -> System:
 
 
 def batch(tree, n: int):
-    """One scenario n times: every leaf, of shape (...), gets the n scenarios as its last axis, (..., n)."""
+    """One scenario, a tree, n times: every leaf, of shape (...), gets the n scenarios as its last axis, (..., n)."""
     n = check.whole("n", n)
 
     def repeated(leaf):

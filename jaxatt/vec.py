@@ -47,7 +47,7 @@ class Vec3(NamedTuple):
 
 
 class Mat3(NamedTuple):
-    """A matrix by rows: three `Vec3`. ``@`` with `Mat3` and `Vec3`, ``+ -`` with `Mat3`, ``*`` with scalars."""
+    """A matrix by rows, three `Vec3` of shape (*lanes): ``@`` with `Mat3` and `Vec3`, ``+ -`` with `Mat3`, ``*``."""
 
     x: Any
     y: Any
@@ -120,14 +120,14 @@ class Quat(NamedTuple):
 
 @door
 def vec3(a) -> Vec3:
-    """Array-like of shape (3, *lanes) to `Vec3`."""
+    """Array-like a of shape (3, *lanes) to `Vec3`."""
     x, y, z = a
     return Vec3(x, y, z)
 
 
 @door
 def mat3(a) -> Mat3:
-    """Array-like of shape (3, 3, *lanes) to `Mat3`."""
+    """Array-like a of shape (3, 3, *lanes) to `Mat3`."""
     return Mat3(*(vec3(row) for row in a))
 
 

@@ -52,7 +52,7 @@ def test_the_mrp_rate_map_is_G_of_the_paper():
         G = ((1 - a @ a) * np.eye(3) + 2 * S + 2 * np.outer(a, a)) / 4
         np.testing.assert_allclose(array(mrp_rate(vec3(a), vec3(b))), G @ b, atol=1e-13)
         np.testing.assert_allclose(array(mrp_rate_transposed(vec3(a), vec3(b))), G.T @ b, atol=1e-13)
-        assert np.linalg.norm(G, 2) == pytest.approx((1 + a @ a) / 4, abs=1e-12)  # spec, 5.5: (3) is 3-4 times this
+        assert np.linalg.norm(G, 2) == pytest.approx((1 + a @ a) / 4, abs=1e-12)  # reference: (3) is 3-4 times this
 
 
 def test_mrp_product_is_the_product_of_the_matrices():

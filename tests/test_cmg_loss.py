@@ -28,7 +28,7 @@ from jaxatt.vec import Quat, Vec3, mat3, once, vec3  # noqa: E402
 
 KEY = jax.random.key(0)
 P, B = cmg.PYRAMID, cmg.BOX
-CASES = [  # structure, gamma(0) [deg], class of the paper, class at K_I = 0.02 (spec, 6), |w(0)|
+CASES = [  # structure, gamma(0) [deg], class of the paper, class at K_I = 0.02, |w(0)|
     (P, (45, 45, 45, 45), 0, 0, 0.0461636114),
     (P, (10, 55, 45, -10), 0, 0, 0.0266025786),
     (P, (90, 0, -90, 0), 1, None, 0.0138676583),  # None: rounding decides
@@ -321,7 +321,7 @@ def test_steering_laws():
 
 
 def test_robust_inverse_ends_the_chatter(paper):
-    """With lam0 = 0.01 and K_I = 0 none of the spec's hard cases fluctuates; dither frees the pyramid's lock."""
+    """With lam0 = 0.01 and K_I = 0 none of the reference's hard cases fluctuates; dither frees the pyramid's lock."""
     robust, dithered = (
         cmg.classify(swept(cmg.table5._replace(steering=law), paper))
         for law in (Steering(lam0=0.01), Steering(lam0=0.01, dither=0.1))

@@ -1,4 +1,4 @@
-"""The gyro loop: mounting, Kalman core, linear analysis, and what the spec says the closed loop does."""
+"""The gyro loop: mounting, Kalman core, linear analysis, and what the reference says the closed loop does."""
 
 import inspect
 from functools import partial

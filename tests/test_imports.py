@@ -20,6 +20,13 @@ MAY = {
     "engine": {"check", "scores", "vec"},
     "linear": PLAIN | {"engine"},
     "study": {"check", "engine"},
+    "designs": {"check"},
+    "summary": {"check"},
+    "campaign": {"check", "engine", "study", "summary"},
+    "tuning": {"check", "engine", "study"},
+    "objectives": PLAIN | ALGEBRA,
+    "replay": PLAIN | {"faults", "engine"},
+    "plot": PLAIN | ALGEBRA | PARTS,
     "systems": PLAIN | ALGEBRA | PARTS | {"engine"},
 }
 

@@ -28,7 +28,7 @@ def last_outside(values, bound, dt):
 
 @pytest.mark.parametrize("sign", [-1, 1])
 def test_the_lyapunov_identity_of_the_observer(sign):
-    """V' = -alpha |xi_q|^2 - beta |xi_w|^2 for clean readings; with noise the exact form of the spec, 5.3."""
+    """V' = -alpha |xi_q|^2 - beta |xi_w|^2 for clean readings; with noise the exact form of the reference."""
     n, J, J_inv, alpha, beta = 200, op.INERTIA, inverse(op.INERTIA), 1.1, 15.0
     draw = lambda size=1.0: vec3(size * RNG.normal(size=(3, n)))
     for noise in (0.0, 0.3):
@@ -103,7 +103,7 @@ def test_the_adaptation_step_is_the_solution_of_19():
 
 
 def windows(params, scenario, now, log):
-    """Tallies of the table of section 3 of the spec."""
+    """Tallies of the table of section 3 of the reference."""
     inside = [(now.t >= a) & (now.t < b) for a, b in ((60, 150), (150, 250), (250, 350))]
     qq, ww = log.e_q @ log.e_q, log.e_w @ log.e_w
     return [

@@ -1,4 +1,4 @@
-"""Singularities of control-moment-gyro clusters: laws, plain oracles, the numbers of the paper and the spec."""
+"""Singularities of control-moment-gyro clusters: laws, plain oracles, the numbers of the paper and the reference."""
 
 import jax
 

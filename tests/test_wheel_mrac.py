@@ -1,4 +1,4 @@
-"""The wheel test bed: its parts' laws, a plain NumPy oracle of the loop, the paper's and the spec's numbers."""
+"""The wheel test bed: its parts' laws, a plain NumPy oracle of the loop, the paper's and the reference's numbers."""
 
 import jax
 
@@ -31,7 +31,7 @@ def uniform(seed, amplitude=0.05, ticks=TICKS):
 
 
 def portable(ticks, amplitude=0.05, seed=12345):
-    """The spec's linear congruential noise (spec, 1.2)."""
+    """The reference's linear congruential noise."""
     v = []
     for _ in range(ticks):
         seed = (1103515245 * seed + 12345) % 2**31
@@ -107,7 +107,7 @@ def test_wheel_has_finite_gradients_everywhere(wheel):
 
 @pytest.mark.parametrize("b_p", [20.0, -20.0])
 def test_lyapunov_identity(b_p):
-    """V = e^2/2 + |b_p| / (2 gamma) (a_r~^2 + a_y~^2) falls as -a_m e^2 (spec, 5.4), for either sign of b_p."""
+    """V = e^2/2 + |b_p| / (2 gamma) (a_r~^2 + a_y~^2) falls as -a_m e^2, for either sign of b_p."""
     a_p, a_m, b_m = 8.0, 10.0, 10.0
     law = Adaptation(gamma=1e-6, sign=np.sign(b_p))
     r, y, y_m, a_r, a_y = np.random.default_rng(1).normal(size=(5, 100)) * [[1e4], [1e4], [1e4], [1], [1]]
@@ -210,7 +210,7 @@ def test_least_squares_is_weighted_regression():
     ],
 )
 def test_closed_form_of_the_estimate(regressor, P0, J):
-    """a~ = a~(0) / (1 + P0 int W^2) over the slew (spec, 3.3), by the estimator itself on noise-free data."""
+    """a~ = a~(0) / (1 + P0 int W^2) over the slew, by the estimator itself on noise-free data."""
     t = (np.arange(4500) + 0.5) * wm.DT
     a = -wm.J_WHEEL / 5.421
     W = (np.asarray(wm.slew(wm.params, t)[0]) if regressor == "attitude" else wm.slew(wm.params, t)[1]) / a
@@ -228,7 +228,7 @@ def test_closed_form_of_the_estimate(regressor, P0, J):
 
 
 def oracle(params, scenario, v, ticks, substeps, sampled):
-    """The loop of the spec's 1.2 and 4 written down once more, in plain floats. Rows: theta, y, a_r, a_y, r, a, P."""
+    """The loop of the reference written down once more, in plain floats. Rows: theta, y, a_r, a_y, r, a, P."""
     p, s, dt = params, scenario, wm.DT
     a_z = -s.J_w / s.J_z
     theta_w = y = y_m = 0.0
@@ -286,7 +286,7 @@ def test_loop_agrees_with_the_oracle(params, scenario, sampled):
     np.testing.assert_allclose(ours / scale, theirs / scale, atol=1e-10)
 
 
-# the spec's numbers
+# the reference's numbers
 
 
 @pytest.fixture(scope="module")
@@ -545,7 +545,7 @@ def test_bad_loop_and_bad_noise_are_refused():
 
 
 def test_adaptation_too_fast_for_the_integration_is_warned_of():
-    """sqrt(b gamma (r^2 + y^2)) = 122 rad/s at the peak with the paper's gamma (spec, 3.5)."""
+    """sqrt(b gamma (r^2 + y^2)) = 122 rad/s at the peak with the paper's gamma."""
     fast = wm.mrac_only._replace(law=Adaptation(gamma=1e-4))
     with pytest.warns(UserWarning, match=r"gamma` = 0.0001 .* in steps of 0.005 s, is stable only .* up to 6325 deg/s"):
         jaxatt.simulate(wm.loop(substeps=4), fast, QUIET, SILENCE[:300], ticks=300)
@@ -597,7 +597,7 @@ def test_lanes_vmap_and_single_runs_agree():
 
 
 def objective(theta, noise, ticks, system):
-    """The spec's cost (spec, 7) over a batch of losses of effectiveness."""
+    """The reference's cost over a batch of losses of effectiveness."""
     log_K, log_gamma, log_P0 = theta
     params = wm.params._replace(K=jnp.exp(log_K), law=Adaptation(gamma=jnp.exp(log_gamma)), P0=jnp.exp(log_P0))
     scenarios = batch(wm.scenario, 4)._replace(

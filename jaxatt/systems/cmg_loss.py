@@ -3,7 +3,8 @@
 A spacecraft at zero total momentum turns because the momentum of its control moment gyros (CMG) has to go
 somewhere. One module fails: its gimbal is stopped and its wheel runs down. The others shall stop the turning by
 PI control of the body rate and a steering law. At a singularity of the remaining modules they lock or shake.
-The plant is integrated at 1 ms, logs and scores see 10 ms, control runs every 0.1 s.
+The plant is integrated at 1 ms, logs and scores see 10 ms, control runs every 0.1 s. Choices
+and errata by number: docs/loops/cmg_loss.md.
 """
 
 from __future__ import annotations
@@ -33,11 +34,12 @@ class Params(NamedTuple):
     """What the engineer ships."""
 
     k_p: Any = 0.2  # () [1/s] rate gain, eq. (7)
-    k_i: Any = 0.02  # () [1/s^2] integral gain as printed in Table 4, which contradicts Table 5 (spec, 6): `table5`
+    k_i: Any = 0.02  # () [1/s^2] integral gain as printed in Table 4, which contradicts Table 5 (erratum 7): `table5`
     steering: Steering = Steering()
     J: Mat3 = Mat3(Vec3(50.0, 0.0, 0.0), Vec3(0.0, 50.0, 0.0), Vec3(0.0, 0.0, 30.0))  # [kg m^2] believed, J_S
     module: ModuleInertia = MODULE  # believed
     spin: Any = 600.0  # () [rad/s] believed wheel speed: h_w = I_ws spin
+    limit: Any = np.inf  # () [rad/s] smooth limit of the commands, limit tanh(u / limit); inf: the drives' alone
 
 
 class Failure(NamedTuple):
@@ -48,7 +50,7 @@ class Failure(NamedTuple):
 
     onset: Any  # [s] inf for a healthy module
     brake: Any  # [N m s] b_r: the wheel runs down with time constant I_ws / b_r; 0: it spins on
-    free: Any  # 1: the gimbal's drive lets go and the gimbal swings, 0: it holds the gimbal
+    free: Any  # [1] 1: the gimbal's drive lets go and the gimbal swings, 0: it holds the gimbal
     friction: Any  # [N m s] of a free gimbal
 
 
@@ -65,7 +67,7 @@ class Scenario(NamedTuple):
     J: Mat3 = Params().J  # [kg m^2] true inertia of the spacecraft without modules
     module: ModuleInertia = MODULE  # true
     tau_g: Any = 0.05  # () [s] lag of the gimbal rates
-    u_max: Any = 1.0  # () [rad/s] limit of the gimbal rates; printed with rad/s^2 (spec, 2)
+    u_max: Any = 1.0  # () [rad/s] limit of the gimbal rates; printed with rad/s^2 (erratum 3)
     std_w: Any = 0.0  # () [rad/s] gyro noise per axis
     bias_w: Vec3 = Vec3(0.0, 0.0, 0.0)  # [rad/s] gyro bias
 
@@ -83,7 +85,7 @@ class Board(NamedTuple):
 
     axes: GimbalAxes  # (n,)
     integral: Vec3  # [rad] of the rate error
-    u: Any  # (n,) [rad/s] gimbal-rate command before the limit
+    u: Any  # (n,) [rad/s] gimbal-rate command before the drives' limit
 
 
 class Drive(NamedTuple):
@@ -91,7 +93,7 @@ class Drive(NamedTuple):
 
     u: Any  # [rad/s] gimbal-rate command after the limit
     brake: Any  # [N m s]
-    free: Any  # 1 or 0
+    free: Any  # [1] 1 or 0
 
 
 class X(NamedTuple):
@@ -142,9 +144,9 @@ class Scores(NamedTuple):
     final: Any  # [rad/s] |w| at the end
     start: Any  # [rad/s] |w| at the start
     momentum: Any  # [N m s] |total momentum| at the end
-    rank_one: Any  # rank one of the torque matrix was met
-    absorbable: Any  # the start's total momentum lies within the hull of what the healthy modules can hold
-    ok: Any  # rate, momentum and gimbal rates were finite
+    rank_one: Any  # bool, rank one of the torque matrix was met
+    absorbable: Any  # bool, the start's total momentum lies within the hull of what the healthy modules can hold
+    ok: Any  # bool, rate, momentum and gimbal rates were finite
 
 
 def init(params: Params, scenario: Scenario):
@@ -180,9 +182,17 @@ def decide(params: Params, now, board: Board, y: Readings):
         J_T = cluster_inertia(params.J, cmg_triads(board.axes, y.gamma), params.module)
         torque = rate_pi(e, integral, J_T, params.k_p, params.k_i)
         a = -torque / (params.module.I_ws * params.spin)  # eq. (7): the gimbals give -h_w T rate
-        return board._replace(integral=integral, u=steer(params.steering, a, board.axes, y.gamma, y.healthy, now.t))
+        u = steer(params.steering, a, board.axes, y.gamma, y.healthy, now.t)
+        return board._replace(integral=integral, u=smoothly_limited(u, params.limit))
 
     return every(PERIOD, now, control, board), ()
+
+
+def smoothly_limited(u, limit):
+    """limit tanh(u / limit), u itself where the limit is inf. Its slope is nowhere zero, as a hard limit's is."""
+    there = jnp.isfinite(limit)
+    safe = jnp.where(there, limit, 1)
+    return jnp.where(there, safe * jnp.tanh(u / safe), u)
 
 
 def tick(params: Params, scenario: Scenario, now, x: X, z: Z, noise):
@@ -251,7 +261,7 @@ def score(params: Params, scenario: Scenario, now, log: Log) -> Scores:
 
 
 def classify(run: Scores):
-    """The class of a run (spec, 6): `FLUCTUATION` of the gimbals, `LOCK` of the rate, or `PROPER`."""
+    """The class of a run (choice 2): `FLUCTUATION` of the gimbals, `LOCK` of the rate, or `PROPER`."""
     variation, ratio = np.asarray(run.variation), np.asarray(run.final) / np.asarray(run.start)
     return np.where(~(variation <= 20), FLUCTUATION, np.where(ratio > 0.2, LOCK, PROPER))
 
@@ -266,6 +276,7 @@ def refuse_bad(params: Params, scenario: Scenario) -> tuple:
     for name in Steering._fields:
         check.not_negative(f"params.steering.{name}", getattr(params.steering, name))
     check.positive("params.spin", params.spin)
+    check.above("params.limit", params.limit, 0, "inf for no limit")
     for name in ModuleInertia._fields:
         check.positive(f"params.module.{name}", getattr(params.module, name))
         check.positive(f"scenario.module.{name}", getattr(scenario.module, name))

@@ -3,7 +3,7 @@
 A rigid body with four wheels in a pyramid is held at zero 3-2-1 Euler angles by a PID law at 2 Hz. `system` knows
 its rate from a 17-state filter of angles (sun and earth sensor), gyros, tachometers and its own dynamics;
 `direct` takes the rate from the gyros alone. Units of the paper: rad, s, in-lbf (torque), in-lbf-s (momentum),
-in-lbf-s^2 (inertia); the published gains assume them.
+in-lbf-s^2 (inertia); the published gains assume them. Choices and errata by number: docs/loops/gyro_ekf.md.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ class Params(NamedTuple):
     alpha: Any = 54.7 * DEG  # () [rad] believed gyro pyramid, Table 2
     beta: Any = 60.0 * DEG  # () [rad]
     gamma: Any = 45.0 * DEG  # () [rad] believed wheel pyramid, Table 2
-    P0: Any = np.ones(17)  # (17,) initial variances, Table 5; of integral and bias: spec, 1
-    Q: Any = np.repeat([1e-10, 1e-8, 0.0], [9, 4, 4])  # (17,) [1/s] spectral densities, Table 5 and spec, 1
+    P0: Any = np.ones(17)  # (17,) initial variances, Table 5; of integral and bias: choice 2
+    Q: Any = np.repeat([1e-10, 1e-8, 0.0], [9, 4, 4])  # (17,) [1/s] spectral densities, Table 5 and choice 2
     R: Any = np.repeat([1.0, 1e-2, 1.0], [3, 4, 4])  # (11,) variances of the measurements, Table 5
     orbit_rate: Any = 0.0  # () [rad/s] believed rate of the reference frame about z; the paper has none
     torque_max: Any = np.inf  # () [in-lbf] limit of a wheel's command; the paper has none
@@ -125,7 +125,7 @@ class Z(NamedTuple):
     """Held between ticks."""
 
     readings: Readings
-    board: Any  # Board or DirectBoard
+    board: Any  # `Board` or `DirectBoard`
     motors: Channel  # (4,) how the wheels turn a command into torque [in-lbf]
     gyros: tuple  # true axes, four Vec3
     wheels: tuple
@@ -156,7 +156,7 @@ class Log(NamedTuple):
     w: Vec3  # [rad/s]
     h: Any  # (4,) [in-lbf-s]
     u: Any  # (4,) [in-lbf] commanded rates of wheel momentum
-    filter: Any  # FilterLog; None for `direct`
+    filter: Any  # `FilterLog`; None for `direct`
 
 
 # the truth
@@ -316,7 +316,7 @@ def suspect(params: Params, now, board: Board, prior: Belief, y: Readings) -> Su
 
 
 def decide_direct(params: Params, now, board: DirectBoard, y: Readings):
-    """One tick of the computer without a filter: the rate by pseudo-inverse of the gyros in use."""
+    """One tick of the computer without a filter: the rate by pseudo-inverse of the gyros in use. No log."""
 
     def law():
         a, b, c, d = y.gyro.valid
@@ -327,7 +327,7 @@ def decide_direct(params: Params, now, board: DirectBoard, y: Readings):
         w = Vec3(*(sum(row[i] * used[i] for i in range(4)) for row in chosen))
         return command(params, now, y.up, vec3(y.integral), vec3(y.angle.value), w)
 
-    return board._replace(u=every(CONTROL, now, law, board.u))
+    return board._replace(u=every(CONTROL, now, law, board.u)), ()
 
 
 # the two closed loops
@@ -366,13 +366,13 @@ def tick(params: Params, scenario: Scenario, now, x: X, z: Z, noise):
 def tick_direct(params: Params, scenario: Scenario, now, x: X, z: Z, noise):
     """One tick of the loop without a filter."""
     readings = sense(params, scenario, now, x, z, noise)
-    board = decide_direct(params, now, z.board, readings)
+    board, _ = decide_direct(params, now, z.board, readings)
     z = z._replace(readings=readings, board=board, motors=motors(scenario, now))
     return x, z, report(params, now, x, board.u, None)
 
 
 def report(params: Params, now, x: X, u, filter_log) -> Log:
-    """The log of one tick."""
+    """The log of one tick; u: (4,) commanded rates [in-lbf]; filter_log: `FilterLog` or None."""
     return Log(x.integral, x.angle, x.angle - target(params, now.t).angle, x.w, x.h, u, filter_log)
 
 
@@ -389,18 +389,18 @@ class Scores(NamedTuple):
     final_error: Any  # [rad] largest |error| of any axis at the end
     rms_error: Any  # [rad] of the pointing error's norm, after `SETTLED`
     peak_h: Any  # [in-lbf-s] largest momentum of any wheel
-    ok: Any  # every number was finite and the angle about y stayed clear of 90 deg
+    ok: Any  # bool, every number was finite and the angle about y stayed clear of 90 deg
 
 
 class FilterScores(NamedTuple):
     """Tallies of a run with the filter: those of `Scores`, then its own."""
 
-    settling: Any
-    peak_error: Any
-    final_error: Any
-    rms_error: Any
-    peak_h: Any
-    ok: Any
+    settling: Any  # [s]
+    peak_error: Any  # [rad]
+    final_error: Any  # [rad]
+    rms_error: Any  # [rad]
+    peak_h: Any  # [in-lbf-s]
+    ok: Any  # bool
     rms_angle: Any  # (3,) [rad] error of the estimated angles, after `SETTLED`
     rms_w: Any  # (3,) [rad/s] error of the estimated rates, after `SETTLED`
     nis: Any  # [1] mean NIS per degree of freedom, after `SETTLED`
@@ -411,7 +411,7 @@ class FilterScores(NamedTuple):
 
 
 def worst(v):
-    """Largest magnitude of three or four components."""
+    """Largest magnitude of v, three or four components."""
     return jnp.max(jnp.abs(jnp.stack(v)), axis=0)
 
 
@@ -445,7 +445,7 @@ def score(params: Params, scenario: Scenario, now, log: Log) -> FilterScores:
 
 
 def consistent(params: Params) -> Params:
-    """The filter with R = sigma^2, Q and P0 to match; Table 5 makes S 1e6 times too large (spec, 5.1)."""
+    """The filter with R = sigma^2, Q and P0 to match; Table 5 makes S 1e6 times too large (erratum 1)."""
     R = np.repeat([1e-4**2, 1e-6**2, 1e-4**2], [3, 4, 4])
     P0 = np.repeat([1.0, 1e-6, 1e-6, 400.0, 1e-6], [3, 3, 3, 4, 4])
     return params._replace(R=R, Q=1e-8 * np.asarray(Params().Q), P0=P0)

@@ -2,7 +2,8 @@
 
 A rigid body is turned to a target by u = -k_q e_q - k_w e_w from *measured* MRP and body rate. A nonlinear
 observer runs beside it; a fault is declared while the norm of its residual exceeds a threshold. Sensor errors
-are held between ticks, but the sensors are read continuously: torque and observer live in the flow.
+are held between ticks, but the sensors are read continuously: torque and observer live in the flow. Choices and
+errata by number: docs/loops/observer_pd.md.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from numpy import sqrt
 from jaxatt import check, scores
 from jaxatt.attitude import mrp_error, mrp_inner, mrp_nearest, mrp_rate
 from jaxatt.bodies import body_acceleration
-from jaxatt.controllers import adapted_rate_gain, pd, saturated
+from jaxatt.controllers import adapted_rate_gain, pd, rate_gain_floor, saturated
 from jaxatt.engine import System
 from jaxatt.estimators import AttitudeRate, mrp_observer, residual_norm
 from jaxatt.faults import Channel, Fault, any_active, check_fault, first_onset, on_axes
@@ -24,7 +25,7 @@ from jaxatt.vec import Mat3, Vec3, array, inverse, norm
 
 DT = 0.1  # [s] sensor errors, alarms and adaptation
 INERTIA = Mat3(Vec3(15.0, 2.0, -1.0), Vec3(2.0, 27.0, 3.0), Vec3(-1.0, 3.0, 30.0))  # [kg m^2]
-STD_Q = 0.3 * jnp.pi / 180 / 4 / 3  # [1] accuracy 0.3 deg as an MRP (angle / 4), taken as 3 sigma (spec, 2)
+STD_Q = 0.3 * jnp.pi / 180 / 4 / 3  # [1] accuracy 0.3 deg as an MRP (angle / 4), taken as 3 sigma (choice 1)
 STD_W = 0.1 * jnp.pi / 180 / 3  # [rad/s] accuracy 0.1 deg/s, taken as 3 sigma
 
 
@@ -36,12 +37,12 @@ class Params(NamedTuple):
     sigma: Any = 0.01  # () [1, rad/s] detection threshold on |xi|
     k_q: Any = 330.0  # () [N m] attitude gain, eq. (10)
     k_w0: Any = 125.0  # () [N m s] rate gain at the start, eq. (19)
-    eps: Any = 0.1  # () [1/s] epsilon of the Lyapunov function (12); not given in the paper (spec, 4)
+    eps: Any = 0.1  # () [1/s] epsilon of the Lyapunov function (12); not given in the paper (choice 2)
     J: Mat3 = INERTIA  # [kg m^2] believed inertia
     q_d: Vec3 = Vec3(0.0, 0.0, 0.0)  # [1] target MRP
     w_d: Vec3 = Vec3(0.0, 0.0, 0.0)  # [rad/s] target rate
     u_max: Any = jnp.inf  # () [N m] torque limit per axis; the paper has none
-    sign: Any = -1.0  # () [1] of w x J w in the observer: -1 Euler, +1 as printed (spec, 5.1)
+    sign: Any = -1.0  # () [1] of w x J w in the observer: -1 Euler, +1 as printed (erratum 1)
 
 
 class Scenario(NamedTuple):
@@ -52,7 +53,7 @@ class Scenario(NamedTuple):
     q_hat: Vec3 = Vec3(0.4, 0.153, -0.634)  # [1] initial estimate
     w_hat: Vec3 = Vec3(-0.87, 0.44, 0.87)  # [rad/s] initial estimate
     J: Mat3 = INERTIA  # [kg m^2] true inertia
-    sign: Any = -1.0  # () [1] of w x J w in the plant: -1 Euler, +1 as printed (spec, 5.1)
+    sign: Any = -1.0  # () [1] of w x J w in the plant: -1 Euler, +1 as printed (erratum 1)
     std_q: Any = STD_Q  # () [1] star-sensor noise per axis
     std_w: Any = STD_W  # () [rad/s] gyro noise per axis
     star: Vec3 = on_axes(Fault(onset=250.0, random=0.03))  # faults per axis [1]
@@ -122,7 +123,7 @@ class Scores(NamedTuple):
     rms_u: Any  # [N m]
     rms_u_ill: Any  # [N m] while ill
     peak_u: Any  # [N m]
-    ok: Any  # every number of the log was finite
+    ok: Any  # bool, every number of the log was finite
 
 
 START_UP = 20.0  # [s] window reported apart: the observer converges and the slew ends
@@ -159,7 +160,7 @@ def decide(params: Params, now, board: Board, y: AttitudeRate):
 
 
 def errors(params: Params, y: AttitudeRate) -> AttitudeRate:
-    """Tracking errors (8), with + in the cross term: as printed, e_q' = G(e_q) w fails (spec, 5.4)."""
+    """Tracking errors (8), with + in the cross term: as printed, e_q' = G(e_q) w fails (erratum 4)."""
     return AttitudeRate(mrp_error(y.q, params.q_d), y.w - params.w_d)
 
 
@@ -169,10 +170,11 @@ def command(params: Params, board: Board, y: AttitudeRate) -> Vec3:
     return saturated(pd(e.q, e.w, params.k_q, board.k_w), params.u_max)
 
 
-def board_flow(params: Params, board: Board, y: AttitudeRate) -> AttitudeRate:
-    """Rate of change of the on-board continuous state, the observer's estimate (7)."""
+def board_flow(params: Params, board: Board, y: AttitudeRate) -> dict[str, Any]:
+    """Rates of what moves on board between ticks: the observer's estimate (7)."""
     u = command(params, board, y)
-    return mrp_observer(board.estimate, y, u, params.J, board.J_inv, params.alpha, params.beta, params.sign)
+    rate = mrp_observer(board.estimate, y, u, params.J, board.J_inv, params.alpha, params.beta, params.sign)
+    return dict(estimate=rate)
 
 
 def tick(params: Params, scenario: Scenario, now, x: X, z: Z, noise):
@@ -192,8 +194,8 @@ def flow(params: Params, scenario: Scenario, t, x: X, z: Z) -> X:
     u = command(params, board, y)
     return X(
         q=mrp_rate(x.q, x.w),  # eq. (1)
-        w=body_acceleration(x.w, u, scenario.J, z.J_inv, scenario.sign),  # eq. (4), sign: spec 5.1
-        estimate=board_flow(params, board, y),
+        w=body_acceleration(x.w, u, scenario.J, z.J_inv, scenario.sign),  # eq. (4), sign: erratum 1
+        **board_flow(params, board, y),
     )
 
 
@@ -220,6 +222,32 @@ def score(params: Params, scenario: Scenario, now, log: Log) -> Scores:
         rms_u_ill=scores.rms(uu, ill),
         peak_u=scores.peak(norm(log.u)),
         ok=scores.always(scores.finite(log)),
+    )
+
+
+class Margins(NamedTuple):
+    """What the paper's proof of stability leaves; all positive: it holds there."""
+
+    k_q: Any  # [N m] above the least attitude gain, eq. (18)
+    eps: Any  # [1/s] below the largest epsilon with Q > 0, after eq. (12)
+    T: Any  # [N m/s] of T_I > 0, eq. (16), for constant gains
+
+
+def margins(params: Params, lambda_max, e_q=0.0, e_w=0.0) -> Margins:
+    """The margins at tracking errors of norms e_q [1] and e_w [rad/s], with k_w = k_w0.
+
+    lambda_max: largest principal moment of the believed inertia [kg m^2]. Pure: its penalty keeps a search of gains
+    where the proof holds. The adaptation (19) leaves that region in time whatever the gains are (spec, 5.7).
+    """
+    eps, k_q = params.eps, params.k_q
+    c = eps * lambda_max * e_w + 1 + e_q * e_q
+    room = params.k_w0 - rate_gain_floor(Vec3(e_q, 0.0, 0.0), eps, lambda_max)
+    positive = room > 0
+    held = eps * k_q - 0.5 * eps * eps - 1 - c * c / jnp.where(positive, room, 1)
+    return Margins(
+        k_q=k_q - eps / 2 - 1 / eps,
+        eps=2 / jnp.sqrt(lambda_max) - eps,
+        T=jnp.where(positive, held, room - 1),
     )
 
 

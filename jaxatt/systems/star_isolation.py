@@ -4,7 +4,8 @@ A satellite on a circular orbit points at the Earth. One star sensor looks along
 axis; each feeds a filter of its own, and both filters share the gyro. A filter whose weighted residual is too
 large blames its sensor; both together blame the gyro. The control loop closes on ideal attitude and rate unless
 told otherwise, so that sensor faults do not enter it. The paper's Table 1 is lost: every number here is ours
-(spec, 5 and 8). Leaves with a sensor axis have shape (2, *lanes): roll-axis star sensor, pitch-axis star sensor.
+(choices 1 and 4). Leaves with a sensor axis have shape (2, *lanes): roll-axis star sensor, pitch-axis star sensor.
+Choices and errata by number: docs/loops/star_isolation.md.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ DT = 0.1  # [s]
 ARCSEC = np.pi / 180 / 3600  # [rad]
 DEG = np.pi / 180  # [rad]
 INERTIA = diagonal((1200.0, 1000.0, 800.0))  # [kg m^2]
-LINEAR_RANGE = 0.5 * DEG  # [rad] pointing error up to which C of eq. (7) holds (spec, 7)
+LINEAR_RANGE = 0.5 * DEG  # [rad] pointing error up to which C of eq. (7) holds (choice 6)
 ROLL, PITCH = 0, 1  # the star sensors, by the axis they look along
 
 
@@ -56,14 +57,14 @@ def _turn(x, y, z) -> Quat:
 
 
 def on_sensor(number: int, faults: Vec3) -> Vec3:
-    """Faults per axis of one star sensor, the other one healthy: a `Vec3` of `Fault` with the sensor axis."""
+    """Faults per axis of one star sensor, number `ROLL` or `PITCH`, the other healthy: a `Vec3` of `Fault` (2,)."""
     healthy = on_axes(Fault())
     pair = (faults, healthy) if number == ROLL else (healthy, faults)
     return jax.tree.map(lambda a, b: np.stack(np.broadcast_arrays(a, b)), *pair)
 
 
 def tangential(number: int, fault: Fault) -> Vec3:
-    """The same fault on the two axes of a star sensor across its boresight; along it a turn moves nothing."""
+    """The same fault on the two axes of star sensor ``number`` across its boresight; along it a turn moves nothing."""
     return Vec3(Fault(), fault, fault) if number == ROLL else Vec3(fault, Fault(), fault)
 
 
@@ -78,7 +79,7 @@ class Params(NamedTuple):
     walk: Any = 0.0  # () [rad/s/sqrt(s)] believed random walk of the gyro bias; 7-state filter only
     law: Any = 0.0  # () where gyro noise is evaluated: 0 second moment (11), 1 estimate, 2 identity, 3 Q - P
     stars: Vec3 = Vec3(np.array([1.0, 0.0]), np.array([0.0, 1.0]), np.array([0.0, 0.0]))  # (2,) catalogue directions
-    threshold: Any = 27.0  # () [1] on the windowed r' M^-1 r: n^2 3 N with n = 3, N = 1 (spec, 4)
+    threshold: Any = 27.0  # () [1] on the windowed r' M^-1 r: n^2 3 N with n = 3, N = 1 (choice 2)
     angle_threshold: Any = 20.5  # () [1] on the squared angle between the stars, chi-square with one degree
     unit: Any = 0.0  # () 1: readings are made unit vectors first, which leaves J two degrees of freedom
     feedback: Any = 0.0  # () what the control closes on: 0 ideal attitude and rate, 1 roll filter, 2 pitch filter
@@ -193,8 +194,8 @@ class Scores(NamedTuple):
     error: Any  # [rad] each: rms of the attitude error
     pointing: Any  # [rad] rms of the angle to the target's frame
     peak_u: Any  # [N m]
-    verdict: Any  # cause by the latched alarms at the end, as a float
-    ok: Any  # every number of the log was finite
+    verdict: Any  # [1] cause by the latched alarms at the end, as a float
+    ok: Any  # bool, every number of the log was finite
 
 
 HEALTHY = on_sensor(ROLL, on_axes(Fault()))  # no fault of either star sensor
@@ -219,7 +220,10 @@ def orbit_rate(rate) -> Vec3:
 
 
 def quaternion_error(x: Quat, P, q: Quat):
-    """Turn [rad] by which the estimate x of q errs, its standard deviation, NEES of the vector part and of all four."""
+    """Turn [rad] by which the estimate x of q errs, its deviation, NEES of the vector part and of all four.
+
+    P: covariance of x, 4 rows of 4.
+    """
     e = x - q
     b = Vec3(*P[0][1:4])
     D_inv = inverse(Mat3(*(Vec3(*row[1:4]) for row in P[1:4])))
@@ -283,7 +287,7 @@ TURN = Generator(  # multiplicative EKF with the exact residual, for large point
 
 
 def init(generator: Generator, window: int, params: Params, scenario: Scenario):
-    """x, z at the start."""
+    """x, z at the start; window: how many values the evaluation sums."""
     o = jnp.zeros(())
     zero = Vec3(o, o, o)
     filters = jax.vmap(partial(generator.start, params))(scenario.q_hat)
@@ -309,7 +313,10 @@ def sense(params: Params, scenario: Scenario, now, x: X, z: Z, noise) -> Sensors
 
 
 def advanced(generator: Generator, params: Params, filters, gyro: Vec3, y: Vec3, dt):
-    """The bank of filters one tick on: predicted with the last gyro reading, updated by the stars y, (2, *lanes)."""
+    """The bank of filters, (2, *lanes), one tick on: predicted with the last gyro reading, updated by the stars y.
+
+    dt: [s] of the tick.
+    """
 
     def one(e, y, s):
         ahead = once(lambda e, w: generator.predict(params, e, w, dt), e, gyro)
@@ -339,24 +346,6 @@ def decide(params: Params, now, board: Board, readings: Readings, generator: Gen
     return Board(filters, readings.gyro, recent, latched, u), verdict
 
 
-def replay(generator: Generator, params: Params, q_hat: Quat, readings: Readings, dt: float = DT) -> Innovation:
-    """Innovations of both filters on recorded readings, time first, shape (T - 1, 2, *lanes); for likelihoods.
-
-    q_hat: initial estimates, (2, *lanes); readings: a run's ``log.readings``, unit-normalised or not as they are.
-    """
-
-    def step(carry, told):
-        filters, gyro = carry
-        filters, innovation = advanced(generator, params, filters, gyro, told.stars, dt)
-        return (filters, told.gyro), innovation
-
-    filters = jax.vmap(partial(generator.start, params))(q_hat)
-    lanes = readings.gyro.x.shape[1:]
-    wide = lambda a: jnp.broadcast_to(a.reshape(a.shape + (1,) * (len(lanes) + 1 - a.ndim)), (2, *lanes))
-    first, later = (jax.tree.map(lambda a, part=part: a[part], readings) for part in (0, slice(1, None)))
-    return jax.lax.scan(jax.checkpoint(step), (jax.tree.map(wide, filters), first.gyro), later)[1]
-
-
 def star_angle(pointing: Vec3, params: Params):
     """Squared error of the cosine between the two measured stars in units of its variance: needs no gyro, no filter.
 
@@ -373,7 +362,7 @@ def _pair(v: Vec3):
 
 
 def command(generator: Generator, params: Params, filters, readings: Readings) -> Vec3:
-    """PD torque [N m] from the ideal attitude or from a filter's estimate and the gyro less its estimated bias."""
+    """PD torque [N m] from the ideal attitude, or from one of the filters and the gyro less its estimated bias."""
     q, w = readings.q, readings.w
     attitudes, biases = jax.vmap(generator.attitude)(filters), jax.vmap(generator.bias)(filters)
     for i in (ROLL, PITCH):
@@ -406,7 +395,7 @@ def flow(params: Params, scenario: Scenario, t, x: X, z: Z) -> X:
     w_r = Quat(o, *orbit_rate(scenario.orbit_rate))
     return X(
         q=quat_rate(x.q, x.w) - 0.5 * (w_r * x.q),  # eq. (2)
-        w=body_acceleration(x.w, u, scenario.J, z.J_inv),  # spec, 8
+        w=body_acceleration(x.w, u, scenario.J, z.J_inv),  # choice 4
     )
 
 

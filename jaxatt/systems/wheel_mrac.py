@@ -1,11 +1,12 @@
 """Single-axis wheel test bed: adaptive wheel-speed control and on-line inertia estimation (Eun, Park & Park, 2016).
 
-A platform on an air bearing is turned by one reaction wheel. An outer loop, which the paper does not give (spec,
-1.1), asks for a wheel speed; model-reference adaptive control (MRAC) makes the wheel follow it; recursive least
+A platform on an air bearing is turned by one reaction wheel. An outer loop, which the paper does not give
+(choice 2), asks for a wheel speed; model-reference adaptive control (MRAC) makes the wheel follow it; recursive least
 squares on the wheel's turns and the measured attitude estimate the platform's inertia (OPE).
 
-Angles are in degrees and speeds in deg/s throughout, as in the paper; the gains are for these units (spec, 3.1).
+Angles are in degrees and speeds in deg/s throughout, as in the paper; the gains are for these units (choice 1).
 `system` adapts continuously; `sampled` adapts once per tick with a held command, as a computer would.
+Choices and errata by number: docs/loops/wheel_mrac.md.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ class Params(NamedTuple):
 
     turn: Any = 90.0  # [deg] slew D
     duration: Any = 90.0  # [s] slew time T
-    K: Any = 1.0  # [1/s] gain of the outer loop; not given in the paper (spec, 3.2)
+    K: Any = 1.0  # [1/s] gain of the outer loop; not given in the paper (choice 2)
     forward: Any = 1.0  # [1] feed-forward of the slew rate; 0 for none
     J_w: Any = J_WHEEL  # [kg m^2] believed wheel inertia
     J_hat: Any = 5.0  # [kg m^2] believed platform inertia at the start
@@ -49,11 +50,11 @@ class Params(NamedTuple):
     law: Adaptation = Adaptation()  # eq. (6)
     ope: Any = 1.0  # [1] 1: the inertia is estimated and the attitude predicted; 0: MRAC only
     P0: Any = 1e-6  # [1/(deg^2 s)] gain of the estimator at the start, eq. (9); in [s/deg^2] if differenced
-    differenced: Any = 0.0  # [1] 1: the estimator compares rates, from differenced readings; 0: angles (spec, 3.3)
+    differenced: Any = 0.0  # [1] 1: the estimator compares rates, from differenced readings; 0: angles (choice 3)
     forget: Any = 0.0  # [1/s] rate at which the estimator forgets
     blend: Any = 0.0  # [1] share L of the measured in the predicted attitude
     J_most: Any = 1e3  # [kg m^2] estimates beyond it, and those whose sign has flipped, are set to it
-    residual_max: Any = 50.0  # [deg/s] alarm threshold on |y - y_m| (spec, 6)
+    residual_max: Any = 50.0  # [deg/s] alarm threshold on |y - y_m| (choice 6)
 
 
 class Scenario(NamedTuple):
@@ -174,7 +175,7 @@ class Scores(NamedTuple):
     unstable_at: Any  # [s] first late time outside the bound of sampled adaptation; inf if never
     flipped_at: Any  # [s] first time at which the estimate was set to J_most; inf if never
     failed_at: Any  # [s] first time at which the run had diverged; inf if never
-    ok: Any  # every number of the log was finite
+    ok: Any  # bool, every number of the log was finite
 
 
 START_UP = 10.0  # [s] window reported apart: the parameters leave their start
@@ -207,7 +208,7 @@ def sense(params: Params, scenario: Scenario, now, x: X, z: Z, noise) -> Held:
 
 
 def tachometer(scenario: Scenario, tacho: Channel, y):
-    """Wheel speed as read [deg/s]; the steps of the quantisation are passed over by gradients."""
+    """Wheel speed y as read [deg/s]; the steps of the quantisation are passed over by gradients."""
     y, step = read(tacho, y), scenario.tacho_step
     coarse = step > 0
     safe = jnp.where(coarse, step, 1)
@@ -215,20 +216,20 @@ def tachometer(scenario: Scenario, tacho: Channel, y):
 
 
 def delayed(line, ticks):
-    """The reading that is ``ticks`` old, between two readings their linear interpolation."""
+    """The reading of the line (k, *lanes), newest first, that is ``ticks`` old, between two linearly interpolated."""
     age = jnp.arange(len(line)).reshape(-1, *[1] * (line.ndim - 1))
     return jnp.sum(jnp.maximum(1 - jnp.abs(age - ticks), 0) * line, axis=0)
 
 
 def decide(params: Params, now, board: Board, readings: Readings):
-    """One tick on board (spec, 1.2): estimate, then desired speed. Returns board and (residual, alarm, flipped)."""
+    """One tick on board (choice 4): estimate, then desired speed. Returns board and (residual, alarm, flipped)."""
     estimate, flipped = estimated(params, now, board, readings)
     target, target_rate = slew(params, now.t)
     increment = board.predicted + estimate.a * (board.turns - board.turns_then)
     predicted = jnp.where(params.differenced > 0, increment, estimate.a * board.turns)
     blended = predicted + params.blend * (readings.theta - predicted)
     feedback = jnp.where(params.ope > 0, blended, readings.theta)
-    r = (params.forward * target_rate + params.K * (target - feedback)) / estimate.a  # spec, 1.1
+    r = (params.forward * target_rate + params.K * (target - feedback)) / estimate.a  # choice 2
     residual = readings.y - board.mrac.y_m
     alarm = ~(jnp.abs(residual) <= params.residual_max)  # so that NaN alarms
     u = mrac_input(board.mrac, r, readings.y)
@@ -240,6 +241,18 @@ def decide_sampled(params: Params, now, board: Board, readings: Readings):
     """`decide`, then the adaptation law by one step of forward Euler."""
     board, out = decide(params, now, board, readings)
     return board._replace(mrac=mrac_step(board.mrac, params.law, board.r, readings.y, now.dt)), out
+
+
+def board_flow(params: Params, board: Board, readings: Readings) -> dict[str, Any]:
+    """Rates of what moves on board between ticks with continuous adaptation: r is held, u is not."""
+    mrac = mrac_flow(board.mrac, params.law, board.r, readings.y, params.a_m, params.b_m)
+    return dict(mrac=mrac, turns=readings.y)
+
+
+def board_flow_sampled(params: Params, board: Board, readings: Readings) -> dict[str, Any]:
+    """The same with sampled adaptation: r and u are held."""
+    y_m = params.b_m * board.r - params.a_m * board.mrac.y_m  # eq. (2)
+    return dict(mrac=Mrac(y_m, jnp.zeros_like(y_m), jnp.zeros_like(y_m)), turns=readings.y)
 
 
 def estimated(params: Params, now, board: Board, readings: Readings):
@@ -298,33 +311,37 @@ tick_sampled = partial(_tick, decide_sampled)
 
 
 def body_rate(scenario: Scenario, t, y):
-    """Rate of the platform [deg/s]: eq. (1), and the momentum that it leaves out."""
+    """Rate of the platform [deg/s] at wheel speed y [deg/s]: eq. (1), and the momentum that it leaves out."""
     return (scenario.momentum + degrees(1) * scenario.torque * t - scenario.J_w * y) / scenario.J_z
 
 
 def flow(params: Params, scenario: Scenario, t, x: X, z: Z) -> X:
-    """dx/dt between ticks with continuous adaptation: r is held, u is not."""
+    """dx/dt between ticks with continuous adaptation; the wheel speed is read continuously."""
     x, moving = _moving(x, z)
-    y = tachometer(scenario, z.sensors.tacho, x.y)
-    mrac = mrac_flow(x.mrac, params.law, z.board.r, y, params.a_m, params.b_m)
-    return moving(_plant(scenario, t, x, z, mrac_input(x.mrac, z.board.r, y), mrac))
+    board, readings = _at(scenario, x, z)
+    u = mrac_input(board.mrac, board.r, readings.y)
+    return moving(X(*_plant(scenario, t, x, z, u), **board_flow(params, board, readings)))
 
 
 def flow_sampled(params: Params, scenario: Scenario, t, x: X, z: Z) -> X:
-    """dx/dt between ticks with sampled adaptation: r and u are held."""
+    """dx/dt between ticks with sampled adaptation: the command is held."""
     x, moving = _moving(x, z)
-    y_m = params.b_m * z.board.r - params.a_m * x.mrac.y_m  # eq. (2)
-    return moving(_plant(scenario, t, x, z, z.board.u, Mrac(y_m, jnp.zeros_like(y_m), jnp.zeros_like(y_m))))
+    board, readings = _at(scenario, x, z)
+    return moving(X(*_plant(scenario, t, x, z, board.u), **board_flow_sampled(params, board, readings)))
 
 
-def _plant(scenario: Scenario, t, x: X, z: Z, u, mrac: Mrac) -> X:
+def _at(scenario: Scenario, x: X, z: Z) -> tuple[Board, Readings]:
+    y = tachometer(scenario, z.sensors.tacho, x.y)
+    return z.board._replace(mrac=x.mrac, turns=x.turns), z.sensors.readings._replace(y=y)
+
+
+def _plant(scenario: Scenario, t, x: X, z: Z, u):
+    # rates of attitude and wheel speed
     wheel = scenario.wheel._replace(friction=z.friction)
     u = jnp.clip(u, -wheel.u_max, wheel.u_max)  # what the drive loses, it loses after its bound
-    return X(
-        theta=body_rate(scenario, t, x.y),
-        y=wheel_acceleration(wheel._replace(u_max=jnp.inf), x.y, read(z.drive, u)),  # eq. (3)
-        mrac=mrac,
-        turns=tachometer(scenario, z.sensors.tacho, x.y),
+    return (
+        body_rate(scenario, t, x.y),
+        wheel_acceleration(wheel._replace(u_max=jnp.inf), x.y, read(z.drive, u)),  # eq. (3)
     )
 
 
@@ -445,7 +462,7 @@ def _warn_of_fast_adaptation(sampled: bool, dt: float, substeps: int, params: Pa
     if sampled:  # r = y on the matching line
         limit = np.sqrt(np.asarray(mrac_sampled_bound(law, dt, wheel.a, wheel.b)) / 2)
         means = f"sampled every {dt:g} s"
-    else:  # the frequency of the adaptation is sqrt(b gamma (r^2 + y^2)) (spec, 3.5); RK4 bears 2.8 per step
+    else:  # the frequency of the adaptation is sqrt(b gamma (r^2 + y^2)) (choice 5); RK4 bears 2.8 per step
         softened = np.abs(wheel.b) * law.gamma / (1 + 2 * law.normalise * speed**2)
         limit = 2 * substeps / dt / np.sqrt(np.maximum(2 * softened, np.finfo(np.float32).tiny))
         means = f"integrated in steps of {dt / substeps:g} s"
@@ -479,6 +496,6 @@ params = Params()  # MRAC and inertia estimation
 scenario = Scenario()
 mrac_only = Params(ope=0.0)
 sampled = loop(sampled=True, substeps=10)
-# The paper's hardware, as far as its words go: low-speed friction, a quiet sensor, a sampled slow law (spec, 4).
+# The paper's hardware, as far as its words go: low-speed friction, a quiet sensor, a sampled slow law (choice 7).
 hardware_params = Params(J_hat=5.421, a_r=0.5, a_y=0.0, law=Adaptation(gamma=1e-8), ope=0.0)
 hardware_scenario = Scenario(wheel=Wheel(friction=25000.0), noise=0.01)

@@ -1,0 +1,84 @@
+"""The site's figures: ``python docs/figures.py RESULTS`` after ``python -m experiments --quick --out RESULTS``.
+
+Takes the figures that the pages name from the results, draws the overview, and stores all as palette PNGs, a third
+of the size.
+"""
+
+import re
+import sys
+import time
+from pathlib import Path
+
+import jax
+import matplotlib
+import numpy as np
+from PIL import Image
+
+import jaxatt
+from jaxatt import study
+from jaxatt.systems import observer_pd as loop
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+HERE = Path(__file__).parent
+TICKS, CELLS, SEEDS = 900, 64, 25
+
+
+def overview():
+    """One run with its alarm, and a hundred thousand: how long a biased gyro is seen, by bias and threshold."""
+    healthy = jaxatt.on_axes(jaxatt.Fault())
+    bias = jaxatt.Fault(onset=30.0, bias=0.03)
+    scenario = loop.scenario._replace(star=healthy, gyro=healthy._replace(x=bias))
+    log = jaxatt.simulate(loop.system, loop.params, scenario, jax.random.key(0), ticks=TICKS)
+
+    sizes, sigmas = np.geomspace(0.002, 0.3, CELLS), np.geomspace(0.001, 0.1, CELLS)
+    size, sigma, _ = (a.ravel() for a in np.meshgrid(sizes, sigmas, np.arange(SEEDS)))
+    params, many = study.batch((loop.params, scenario), size.size)
+    many = many._replace(gyro=many.gyro._replace(x=many.gyro.x._replace(bias=size)))
+    pairs = jax.tree.map(np.float32, (params._replace(sigma=sigma), many))
+
+    def score(_, pair, now, log):
+        return loop.score(*pair, now, log)
+
+    started = time.perf_counter()
+    scores = jaxatt.sweep(study.varied(loop.system), (), pairs, jax.random.key(1), ticks=TICKS, score=score)
+    took = time.perf_counter() - started
+    seen, false = ((a.reshape(CELLS, CELLS, SEEDS)).mean(-1) for a in (1 - scores.miss, scores.false_alarms))
+    print(f"{size.size} runs of {TICKS * loop.DT:.0f} s took {took:.0f} s, compilation included")
+
+    fig, (left, right) = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
+    t = loop.DT * np.arange(TICKS)
+    left.semilogy(t, log.xi, color="#0072b2", linewidth=0.8, label="residual norm")
+    left.axhline(loop.params.sigma, color="#d55e00", linestyle="--", label="threshold")
+    left.axvline(30, color="0.3", linestyle=":", label="gyro bias of 0.03 rad/s")
+    left.set(xlabel="time [s]", ylabel="residual norm [MRP, rad/s]", title="One run")
+    left.legend(loc="upper right", fontsize="small")
+    image = right.pcolormesh(sizes, sigmas, seen, cmap="cividis", vmin=0, vmax=1, shading="nearest", rasterized=True)
+    one_percent = float(np.exp(np.interp(-0.01, -false.mean(1), np.log(sigmas))))  # it falls with the threshold
+    right.axhline(one_percent, color="w", linewidth=3)
+    right.axhline(one_percent, color="k", linewidth=1.2, linestyle="--", label="1 % false alarms in healthy time")
+    right.plot([0.03], [loop.params.sigma], "o", color="w", markeredgecolor="k", label="the run at the left")
+    right.set(xscale="log", yscale="log", xlabel="gyro bias [rad/s]", ylabel="detection threshold [MRP, rad/s]")
+    right.set_title(f"{size.size:,} runs".replace(",", " "))
+    right.legend(loc="upper left", fontsize="small")
+    fig.colorbar(image, ax=right, label="share of faulty time with alarm [1]")
+    fig.savefig(HERE / "figures" / "overview.png", dpi=130)
+
+
+def shrunk(source: Path, target: Path) -> None:
+    """Store as a palette PNG of at most 1400 pixels' width."""
+    with Image.open(source) as image:
+        image = image.convert("RGB")
+        image.thumbnail((1400, 2800), Image.Resampling.LANCZOS)
+        image.quantize(128, dither=Image.Dither.NONE).save(target, optimize=True)
+
+
+if __name__ == "__main__":
+    jaxatt.fast_cpu()
+    overview()
+    shrunk(HERE / "figures" / "overview.png", HERE / "figures" / "overview.png")
+    named = {name for page in HERE.glob("loops/*.md") for name in re.findall(r"figures/(\w+)\.png", page.read_text())}
+    for name in sorted(named):
+        (system,) = [p.name for p in Path(sys.argv[1]).iterdir() if p.is_dir() and name.startswith(p.name)]
+        shrunk(Path(sys.argv[1]) / system / f"{name.removeprefix(system + '_')}.png", HERE / "figures" / f"{name}.png")

@@ -1,0 +1,1 @@
+"""Gains tuned by gradient, one module per closed loop."""

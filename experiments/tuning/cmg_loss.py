@@ -1,0 +1,293 @@
+"""Loss of a control moment gyro: gains, steering and rearrangement by gradient, and where the gradient lies.
+
+A gradient says what an infinitesimal step does. Near a singularity of the remaining modules the pseudo-inverse
+commands rates far beyond the drives' limit, and the gimbals shake between the two ends of it. There the gradient is
+right, to all digits that a central difference can show, and useless: a step of one per cent does something else.
+A smooth limit on board and the robust inverse make it useful again, each for starts of its own.
+
+Scenarios come from three seeds: one to tune on, one to choose by, one for the verdict, which chose nothing.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from experiments.cmg_loss import COLOURS, SKEW, stacked
+from experiments.report import plt
+from experiments.tuning.compare import (
+    contest,
+    descent,
+    gradient_price,
+    one_by_one,
+    paired_ratio,
+    paired_share,
+    told,
+)
+from jaxatt import scores, simulate, sweep, tune
+from jaxatt.controllers import Steering
+from jaxatt.study import varied
+from jaxatt.systems import cmg_loss as cmg
+from jaxatt.systems.cmg_loss import DT, PROPER, Params
+from jaxatt.vec import Vec3
+
+TUNE, CHOOSE, VERDICT = range(3)  # seeds
+KEY = jax.random.key(TUNE)  # the loop draws no noise
+SYSTEM = cmg.system._replace(substeps=1)  # 10 ms plant steps: they keep the shares of the classes (Monte Carlo)
+
+
+def run(report) -> None:
+    """Both studies."""
+    evidence(report)
+    tuned(report)
+
+
+# where the gradient lies
+
+LAWS = {  # K_I as printed
+    "pseudo-inverse": Params(),
+    "pseudo-inverse, smooth limit": Params(limit=1.0),
+    "robust inverse": Params(steering=Steering(lam0=0.01)),
+}
+STARTS = {  # structure and gimbal angles [deg]
+    "pyramid, smooth": ("pyramid", (45, 45, 45, 45)),
+    "pyramid, shaking": ("pyramid", (-95, 90, 85, 95)),
+    "box-90, shaking": ("box-90", (-95, 90, 85, 95)),
+    "box-90, stuck": ("box-90", (-90, 90, 90, 95)),
+}
+SPREAD = 0.05  # [deg] of the gimbal angles around each start; the first of them is the start itself
+HORIZONS = np.array([1, 2, 5, 10, 20, 40, 60])  # [s]
+LITTLE, STEP = 1e-6, 1e-2  # steps in ln K_P: of a central difference, and of a search
+
+
+def curves(log_factor, params: Params, scenario, ticks: int):
+    """Costs over time, K_P times exp(log_factor (lanes,)): one number a second, two costs of shape (seconds, lanes).
+
+    Rate: integral of |w|^2 / |w(0)|^2 [s]. Wear: total variation of the gimbal rates [rad/s].
+    """
+    params = params._replace(k_p=params.k_p * jnp.exp(log_factor))
+    n = params.k_p.shape[-1]
+    log = simulate(varied(SYSTEM), (), (params, scenario), jax.random.split(KEY, n), ticks=ticks)
+    square = log.w @ log.w
+    each = round(1 / DT)
+    return jnp.cumsum(square, 0)[each::each] * DT / square[0], jnp.cumsum(log.variation, 0)[each::each]
+
+
+@partial(jax.jit, static_argnums=3)
+def slopes(log_factor, params, scenario, ticks):
+    """Derivatives of `curves` by ln K_P."""
+    f = lambda a: curves(a, params, scenario, ticks)
+    return jax.jvp(f, (log_factor,), (jnp.ones_like(log_factor),))[1]
+
+
+def evidence(report) -> None:
+    """Gradient, central difference and what a real step does, as the horizon grows."""
+    n, ticks = (4 if report.quick else 16), 6001
+    rng = np.random.default_rng(TUNE)
+    params, scenarios = [], []
+    for structure, gamma in STARTS.values():
+        moved = np.array(gamma) + SPREAD * rng.uniform(-1, 1, (n, 4)) * (np.arange(4) < 3) * (np.arange(n) > 0)[:, None]
+        for law in LAWS.values():
+            params += [law] * n
+            scenarios += [cmg.lost(SKEW[structure], g) for g in moved]
+    params, scenarios = stacked(params), stacked(scenarios)
+    zero = np.zeros(len(STARTS) * len(LAWS) * n)
+    value = jax.jit(curves, static_argnums=3)
+    shape = (len(STARTS), len(LAWS), n)
+    at = lambda step: [
+        np.asarray(a)[HORIZONS - 1].reshape(-1, *shape) for a in value(zero + step, params, scenarios, ticks)
+    ]
+    gradient = [np.asarray(a)[HORIZONS - 1].reshape(-1, *shape) for a in slopes(zero, params, scenarios, ticks)]
+    little = [(up - down) / (2 * LITTLE) for up, down in zip(at(LITTLE), at(-LITTLE))]
+    step = [(up - down) / (2 * STEP) for up, down in zip(at(STEP), at(-STEP))]
+
+    report.note("median over starts within 0.05 deg, derivative of the 60 s costs by ln K_P, and the share of starts")
+    report.note("where it tells what a step of 1 % in K_P does, to 20 %; rate cost [s], wear [rad/s]")
+    honest = []
+    for cost in range(2):
+        scale = np.abs(gradient[cost]) + np.abs(step[cost]) + 1e-12
+        honest.append(np.abs(gradient[cost] - step[cost]) <= 0.2 * scale / 2)
+    for i, start in enumerate(STARTS):
+        for j, law in enumerate(LAWS):
+            words = []
+            for cost, name in enumerate(("rate", "wear")):
+                g, d, s = (np.median(np.abs(a[cost][-1, i, j])) for a in (gradient, little, step))
+                words.append(
+                    f"{name}: gradient {g:9.3g}, difference {d:9.3g}, 1 % step {s:9.3g}, told {honest[cost][-1, i, j].mean():4.0%}"
+                )
+            report.note(f"{start:20} {law:30} " + "; ".join(words))
+    error = np.max([np.abs(g / d - 1)[:, 0, :, 0] for g, d in zip(gradient, little)])
+    report.within("gradient / central difference - 1, smooth start", None, 1e-5, error, "float64, both costs, to 60 s")
+    m = len(zero) // len(LAWS)
+    factors = np.geomspace(0.8, 1.25, m)
+    exact = stacked([cmg.lost(SKEW["pyramid"], STARTS["pyramid, shaking"][1])] * len(zero))
+    several = stacked([law for law in LAWS.values() for _ in range(m)])
+    terrain = [np.asarray(a)[-1].reshape(-1, m) for a in value(np.tile(np.log(factors), 3), several, exact, ticks)]
+    evidence_figure(report, honest, n, factors, terrain)
+
+
+def evidence_figure(report, told_right, n: int, factors, terrain) -> None:
+    """How often the gradient tells a real step, over the horizon; and the cost over K_P from the bang-bang start."""
+    fig, axes = plt.subplots(2, 3, figsize=(12, 6.5), layout="constrained")
+    for ax, (j, law) in zip(axes[0], enumerate(LAWS)):
+        for i, (start, colour, dash) in enumerate(zip(STARTS, COLOURS, ("-", "--", "-.", ":"))):
+            share = told_right[1][:, i, j].mean(-1)
+            ax.plot(HORIZONS, share, color=colour, ls=dash, marker="o", ms=4, label=start)
+        ax.set(title=law, xscale="log", xlabel="horizon [s]", ylim=(-0.05, 1.05))
+        ax.set_xticks(HORIZONS, [str(h) for h in HORIZONS])
+        ax.minorticks_off()
+        ax.grid(alpha=0.3)
+    axes[0, 0].set_ylabel(f"share of {n} starts where the gradient\ntells a 1 % step to 20 %, wear")
+    axes[0, 1].legend(fontsize=8)
+    for ax, wear in zip(axes[1], terrain[1]):
+        ax.plot(factors, wear, color=COLOURS[1], marker=".", lw=0.8)
+        ax.set(xlabel="$K_P$ / the paper's", yscale="log", ylim=(0.5 * terrain[1].min(), 2 * terrain[1].max()))
+        ax.grid(alpha=0.3)
+    axes[1, 0].set_ylabel("wear over 60 s from\npyramid [-95, 90, 85, 95] [rad/s]")
+    report.figure("where_the_gradient_lies", fig)
+
+
+# gains, steering and rearrangement
+
+BASES = {"pyramid": (-90, 90, 90, 95), "box-90": (-90, 90, 90, 95)}  # both shake, [deg]
+LIMIT = np.radians(5.0)  # of the rearrangement
+STD_H = 0.15  # [N m s] per axis, total momentum at the start
+SECONDS = 30
+WEAR = 1e-3  # [s^4/rad^2] price of the mean square acceleration of the gimbals, against the rate's energy
+NAMES = ("K_P [1/s]", "K_I [1/s^2]", "lam0", "mu", "dither")
+START = np.concatenate([np.log([0.2, 0.02, 0.01, 10.0, 0.1]), np.zeros(6)])
+
+
+def momenta(seed: int, n: int) -> np.ndarray:
+    """Initial total momenta, (3, 2 n) [N m s]: the same n for the pyramid and for box-90."""
+    h = STD_H * np.random.default_rng([seed, 11]).normal(size=(3, n))
+    return np.tile(h, 2)
+
+
+def days(h, shift):
+    """Scenarios of both structures: momenta h (3, 2 n), healthy gimbals rearranged by shift (2, 3) [rad]."""
+    n = h.shape[-1] // 2
+    base = stacked([cmg.lost(SKEW[name], gamma) for name, gamma in BASES.items() for _ in range(n)])
+    moved = jnp.repeat(jnp.concatenate([shift, jnp.zeros((2, 1))], axis=1).T, n, axis=1, total_repeat_length=2 * n)
+    return base._replace(h=Vec3(*h), gamma=base.gamma + moved)
+
+
+def design(theta) -> tuple[Params, Any]:
+    """Gains and steering, and the rearrangement (2, 3) [rad], of theta (11,): logarithms, and a bounded number each."""
+    k_p, k_i, lam0, mu, dither = jnp.exp(theta[:5])
+    steering = Steering(lam0=lam0, mu=mu, dither=dither)
+    return Params(k_p=k_p, k_i=k_i, steering=steering), LIMIT * jnp.tanh(theta[5:].reshape(2, 3))
+
+
+def costs(params: Params, scenarios):
+    """Rate's energy over its start, priced wear added, of every run, (lanes,)."""
+    n = scenarios.gamma.shape[-1]
+    log = simulate(SYSTEM, params, scenarios, jax.random.split(KEY, n), ticks=round(SECONDS / DT))
+    square = log.w @ log.w
+    return jnp.sum(square, 0) * DT / square[0] + WEAR * SECONDS * jnp.mean(log.acceleration, 0)
+
+
+BEFORE = {
+    "as printed": (Params(), np.zeros((2, 3))),
+    "K_I = 0": (cmg.table5, np.zeros((2, 3))),
+    "K_I = 0, grid rearranged": (cmg.table5, np.radians([[-5.0, 0, -5], [-5, 0, -5]])),
+    "robust inverse": (LAWS["robust inverse"], np.zeros((2, 3))),
+}
+
+
+def tuned(report) -> None:
+    """Tune, choose, judge."""
+    n = 16
+    steps = 6 if report.quick else 25
+    here = momenta(TUNE, n)
+
+    def mean_cost(theta, h):
+        params, shift = design(theta)
+        return jnp.mean(costs(params, days(h, shift)))
+
+    cost = lambda theta, key: mean_cost(theta, here)
+    _, history = tune(cost, START, OPTIMIZER, steps, KEY, forward=True)
+    value = jax.jit(mean_cost)
+    budget = 60 if report.quick else 250
+    low, high = START - np.repeat([np.log(10), 2.5], [5, 6]), START + np.repeat([np.log(10), 2.5], [5, 6])
+    contest(report, descent(history, gradient_price(START.size)), one_by_one(lambda x: value(x, here)), START, low, high,
+            budget, "s", seeds=range(2))  # fmt: skip
+    other = momenta(CHOOSE, n)
+    best = history.theta[int(np.argmin([float(value(theta, other)) for theta in history.theta]))]
+    params, shift = jax.tree.map(np.asarray, design(best))
+    report.note("tuned: " + ", ".join(f"{name} {a:.3g}" for name, a in zip(NAMES, np.exp(best[:5]))))
+    for (name, gamma), move in zip(BASES.items(), np.degrees(shift)):
+        report.note(f"  {name} {list(gamma)} deg rearranged by {', '.join(f'{a:.2f}' for a in move)} deg")
+
+    n = 64 if report.quick else 512
+    h = momenta(VERDICT, n)
+    runs = {name: judged(design, h) for name, design in (BEFORE | {"tuned": (params, shift)}).items()}
+    after = runs["tuned"]
+    for name, before in runs.items():
+        shares = np.bincount(before["class"], minlength=3) / (2 * n)
+        report.note(f"{name:26} proper {shares[0]:.3f}, lock {shares[1]:.3f}, fluctuation {shares[2]:.3f}; "
+                    f"median settling {np.median(before['settling']):.1f} s, wear {before['wear'].mean():.3g} rad/s")  # fmt: skip
+    report.note(f"verdict: {n} held-out momenta for each structure, 60 s")
+    for name in BEFORE:
+        before = runs[name]
+        report.note(f"tuned against {name}:")
+        report.note(told("  share proper", paired_share(before["class"] == PROPER, after["class"] == PROPER)))
+        report.note(told("  cost", paired_ratio(before["cost"], after["cost"]), ratio=True))
+        report.note(told("  rate energy [s]", paired_ratio(before["rate"], after["rate"]), ratio=True))
+        report.note(told("  wear [rad/s]", paired_ratio(before["wear"], after["wear"]), ratio=True))
+        ratio = paired_ratio(before["cost"], after["cost"])
+        report.within(f"cost, tuned / {name}, upper end", None, 1.0, ratio.high, "held-out momenta, paired 95 %")
+    printed = runs["as printed"]
+    share = paired_share(printed["class"] == PROPER, after["class"] == PROPER)
+    report.within(
+        "share of proper runs, tuned less as printed, lower end", 0.0, None, share.low, "held-out, paired 95 %"
+    )
+    tuned_figure(report, runs, n)
+
+
+OPTIMIZER = optax.adam(0.15, b2=0.95)
+
+
+def verdict_score(params, scenario, now, log):
+    """What the verdict looks at, beside the scores of the loop."""
+    within = now.t < SECONDS
+    square = log.w @ log.w
+    return (
+        cmg.score(params, scenario, now, log),
+        scores.mean(square / log.w0**2, within),
+        scores.mean(log.acceleration, within),
+    )
+
+
+def judged(design, h) -> dict:
+    """Classes, costs and so on of a design on held-out momenta."""
+    params, shift = design
+    scenarios = jax.tree.map(np.asarray, days(h, shift))
+    got, rate, acceleration = sweep(SYSTEM, params, scenarios, KEY, ticks=6001, score=verdict_score)
+    cost = SECONDS * (rate + WEAR * acceleration)
+    return dict(
+        cost=cost, rate=SECONDS * rate, wear=got.variation, settling=got.settling, **{"class": cmg.classify(got)}
+    )
+
+
+def tuned_figure(report, runs: dict, n: int) -> None:
+    fig, axes = plt.subplots(1, 2, figsize=(11, 4), layout="constrained", sharey=True)
+    for ax, (structure, part) in zip(axes, (("pyramid", slice(0, n)), ("box-90", slice(n, None)))):
+        for x, name in enumerate(runs):
+            cls, bottom = runs[name]["class"][part], 0.0
+            for k, (label, colour) in enumerate(
+                zip(("proper", "lock", "fluctuation"), (COLOURS[2], "#F0E442", COLOURS[1]))
+            ):
+                share = np.mean(cls == k)
+                ax.bar(x, share, bottom=bottom, color=colour, edgecolor="0.3", lw=0.5, label=label if x == 0 else None)
+                bottom += share
+        ax.set_xticks(range(len(runs)), [name.replace(", ", ",\n") for name in runs], fontsize=8)
+        ax.set_title(f"{structure} {list(BASES[structure])} deg, {n} held-out momenta", fontsize=10)
+    axes[0].set_ylabel("share of runs")
+    axes[1].legend(loc="lower left")
+    report.figure("classes_before_after", fig)

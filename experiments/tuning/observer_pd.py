@@ -1,0 +1,429 @@
+"""Gains and threshold of Yun & Kang (2020) by gradient: alpha, beta, sigma, k_q and k_w0 together.
+
+One cost for every purpose: post-fault attitude error and torque, detection delay and missed time, each over what
+the paper's gains give, with weights; and penalties that keep what must not become worse. All points, two tuned ones
+and two fronts, are found side by side by one search over fresh scenarios. Three seeds: one to tune on, one to choose
+and draw on, and one for the verdict, which no number was chosen on.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+import optax
+
+from experiments.observer_pd import FINE, QUIET, last_outside
+from experiments.report import interval
+from experiments.tuning import compare
+from jaxatt import Fault, Vec3, objectives, on_axes, scores, simulate, sweep
+from jaxatt.objectives import penalty, weighted
+from jaxatt.study import varied
+from jaxatt.systems import observer_pd as op
+from jaxatt.tuning import best_of, bounded, multi_start, tune, worst_case
+from jaxatt.vec import norm
+
+TICKS = 400  # 40 s: a slew, a gyro fault that grows from 15-20 s on, a star-sensor fault from 30-35 s on
+QUIET_FROM = 5.0  # [s] from here to the onset an alarm is a false one; the observer converges meanwhile
+TEMPERATURE = 0.1  # [1] of the smooth alarm, in thresholds
+N = 128  # scenarios of a cost
+RATE = 0.1  # of Adam at the start; it falls to a twentieth
+LAMBDA = 31.8566039  # [kg m^2] largest principal moment of the believed inertia
+TUNING, CHOICE, VERDICT = (jax.random.key(seed) for seed in (2030, 2031, 2032))
+PAPER = dict(alpha=1.1, beta=15.0, sigma=0.01, k_q=330.0, k_w0=125.0)
+BY_HAND = {**PAPER, "k_q": 250.0, "k_w0": 55.0}
+BOUNDS = bounded(
+    dict(alpha=0.05, beta=1.0, sigma=1e-3, k_q=20.0, k_w0=5.0),
+    dict(alpha=20.0, beta=500.0, sigma=0.1, k_q=2000.0, k_w0=1000.0),
+)
+HELD = ("rms_u", "peak_u", "transient", "soft_settling")  # must not become worse
+WEIGHTS = ("post_q", "post_u", "soft_delay", "soft_miss", "log_false")
+TUNED = {"balanced": (4.0, 1.0, 1.0, 1.0, 0.4), "watchful": (4.0, 1.0, 1.0, 1.0, 0.1)}  # weights of the tuned points
+TRACKING = [(w, 1.0, 1.0, 1.0, 0.4) for w in (0.5, 1.5, 12.0)]  # of the fronts around them
+DETECTION = [(4.0, 1.0, 1.0, 1.0, w) for w in (0.06, 0.15, 0.22)]
+CASES = np.array([*TUNED.values(), *TRACKING, *DETECTION])
+
+
+def run(report) -> None:
+    """All checks and figures of the study."""
+    reference = means(scored(PAPER, *days(TUNING, 2048)))
+    found, history = search(reference, 12 if report.quick else 40)
+    for name, gains in zip(TUNED, found):
+        report.note(f"{name}: " + ", ".join(f"{k} {v:.4g}" for k, v in gains.items()))
+    best_random = fronts(report, reference, found)
+    verdict(report, reference, found, best_random)
+    way(report, history)
+    worst(report, found[0])
+    budget(report, reference)
+
+
+# the scenarios
+
+
+def drawn(key, n: int) -> op.Scenario:
+    """n days: attitude, rate, the observer's start error, both faults' onsets, sizes and directions at random."""
+    k = iter(jax.random.split(key, 11))
+    normal = lambda size: Vec3(*(size * jax.random.normal(next(k), (3, n))))
+    uniform = lambda low, high: jax.random.uniform(next(k), (n,), minval=low, maxval=high)
+    axis = normal(1.0)
+    q = axis * (jnp.tan(uniform(60.0, 150.0) * jnp.pi / 180 / 4) / norm(axis))
+    w = normal(0.5)
+    way = normal(1.0)
+    bias = way * (uniform(0.01, 0.06) / norm(way))
+    onset, tau = uniform(15.0, 20.0), uniform(0.5, 5.0)
+    star_onset, star_size = uniform(30.0, 35.0), uniform(0.003, 0.02)
+    healthy = jax.tree.map(lambda a: jnp.full(n, a), op.scenario)
+    one = jax.tree.map(lambda a: jnp.full(n, a), Fault())
+    return healthy._replace(
+        q=q, w=w, q_hat=q + normal(0.05), w_hat=w + normal(0.05),
+        gyro=Vec3(*(one._replace(onset=onset, drift=b, tau=tau) for b in bias)),
+        star=on_axes(one._replace(onset=star_onset, random=star_size)),
+    )  # fmt: skip
+
+
+def days(key, n: int):
+    """n scenarios and the key of their noise."""
+    return jax.device_get(drawn(jax.random.fold_in(key, 0), n)), jax.random.fold_in(key, 1)
+
+
+# the cost
+
+
+def score(params: op.Params, scenario: op.Scenario, now, log: op.Log) -> dict:
+    """What is judged, by the loop's own names, and the smooth stand-ins that are tuned."""
+    real = op.score(params, scenario, now, log)
+    onset = scenario.gyro.x.onset
+    before = now.t < onset
+    quiet = before & (now.t >= QUIET_FROM)
+    q = norm(log.e_q)
+    soft = objectives.detection(
+        now, objectives.alarm(log.xi, params.sigma, TEMPERATURE * params.sigma), onset, QUIET_FROM
+    )
+    return dict(
+        post_q=real.rms_q_ill,  # [1] true attitude error after the first onset, rms of a run
+        post_u=real.rms_u_ill,  # [N m]
+        rms_u=real.rms_u,  # [N m] whole run
+        peak_u=real.peak_u,  # [N m]
+        transient=scores.mean(q, before),  # [1] attitude error of the slew
+        settling=real.settling,  # [s]
+        delay=real.delay,  # [s]
+        miss=real.miss,  # [1]
+        false_alarms=scores.mean(log.alarm, quiet),  # [1]
+        soft_settling=scores.total(now.dt * objectives.alarm(q, 0.01, 0.002), before),  # [s] time outside the band
+        soft_delay=soft.delay, soft_miss=soft.miss, soft_false=soft.false_alarms,
+        ok=real.ok,
+    )  # fmt: skip
+
+
+def scored(gains: dict, scenarios: op.Scenario, key) -> dict:
+    """The scores of each scenario under the given gains."""
+    return sweep(op.system, op.params._replace(**gains), scenarios, key, ticks=TICKS, score=score)
+
+
+def means(s: dict) -> dict:
+    return {name: float(np.mean(values)) for name, values in s.items()}
+
+
+def terms(s: dict, reference: dict) -> dict:
+    """The terms of the cost: scores over what the paper's gains give."""
+    return {name: jnp.mean(s[name]) / reference[name] for name in (*WEIGHTS[:4], "soft_false", *HELD)}
+
+
+def cost_of(free, key, reference: dict, weights):
+    """The cost of the gains BOUNDS.within(free) on N scenarios drawn from the key; weights as in WEIGHTS."""
+    gains = BOUNDS.within(free)
+    s = scored(gains, drawn(jax.random.fold_in(key, 0), N), jax.random.fold_in(key, 1))
+    t = terms(s, reference)
+    t["log_false"] = jnp.log(t["soft_false"])
+    proof = op.margins(op.params._replace(**gains), LAMBDA)
+    held = sum(penalty(t[name] - 0.95) for name in HELD) + penalty(1 - proof.k_q) + penalty(0.1 - proof.T)
+    return weighted(t, dict(zip(WEIGHTS, weights))) + 100 * held
+
+
+def search(reference: dict, steps: int):
+    """All cases side by side, from the paper's gains, on other scenarios at every step; gains, and the history."""
+
+    def cost(theta, key):  # the case rides along: its gradient is zero, so no step moves it
+        case = jax.lax.stop_gradient(theta["case"]).astype(int)
+        return cost_of(theta["free"], key, reference, jnp.asarray(CASES)[case])
+
+    n = len(CASES)
+    free = jax.tree.map(lambda a: jnp.full(n, a), BOUNDS.free(PAPER))
+    rate = optax.cosine_decay_schedule(RATE, steps, 0.05)
+    _, history = multi_start(cost, dict(free=free, case=np.arange(n, dtype=float)), optax.adam(rate), steps, TUNING,
+                             fresh=True)  # fmt: skip
+    best, _ = best_of(history)
+    gains = BOUNDS.within(best["free"])
+    return [{name: float(gains[name][i]) for name in PAPER} for i in range(n)], history
+
+
+# fronts: what the tuned points are worth among others
+
+BLUE, ORANGE, GREEN, PINK = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
+
+
+def hard(s: dict, scenarios: op.Scenario) -> dict:
+    """The scores by which gains are judged, each a finite number per scenario: no stand-ins."""
+    onset = scenarios.gyro.x.onset
+    names = ("post_q", "post_u", "rms_u", "peak_u", "transient", "miss", "false_alarms")
+    return {name: np.asarray(s[name]) for name in names} | dict(
+        settling=np.minimum(s["settling"], onset), delay=np.minimum(s["delay"], 0.1 * TICKS - onset)
+    )
+
+
+def random_gains(n: int, seed: int = 0) -> dict:
+    """Gains and threshold drawn evenly in ratios, up to three times more or less than the paper's."""
+    rng = np.random.default_rng(seed)
+    return {name: value * 3.0 ** rng.uniform(-1, 1, n) for name, value in PAPER.items()}
+
+
+def each_judged(gains: dict, n: int) -> dict:
+    """Mean scores of many sets of gains, leaves of shape (sets,), each on the same n scenarios of CHOICE: a sweep."""
+    sets = len(gains["alpha"])
+    scenarios, key = days(CHOICE, n)
+    repeated = jax.tree.map(lambda a: np.tile(a, sets), scenarios)
+    spread = lambda a: np.full(n * sets, a)
+    params = jax.tree.map(spread, op.params)._replace(**{name: np.repeat(v, n) for name, v in gains.items()})
+    swept = sweep(
+        varied(op.system), (), (params, repeated), key, ticks=TICKS, score=lambda _, pair, *a: score(*pair, *a)
+    )
+    judged = hard(swept, repeated) | dict(ok=swept["ok"])
+    return {name: np.mean(a.reshape(sets, n), axis=1) for name, a in judged.items()}
+
+
+def fronts(report, reference: dict, found: list[dict]) -> dict:
+    """500 random sets of gains, the paper's, the hand-picked and the tuned ones in two planes; the best random set."""
+    sets, n = (100, 64) if report.quick else (500, 64)
+    drawn_gains = random_gains(sets)
+    points = [PAPER, BY_HAND, *found]
+    every = {name: np.concatenate([drawn_gains[name], [g[name] for g in points]]) for name in PAPER}
+    judged = each_judged(every, n)
+    at = {name: values[sets] for name, values in judged.items()}  # the paper's
+    kept = np.all([judged[name] <= at[name] for name in ("rms_u", "peak_u", "transient", "settling")], axis=0)
+    quiet = judged["false_alarms"] <= at["false_alarms"]
+    linear = dict(zip(("post_q", "post_u", "delay", "miss"), TUNED["balanced"]))
+    price = sum(weight * judged[name] / at[name] for name, weight in linear.items())
+    price = np.where(kept & quiet & judged["ok"].astype(bool), price, np.inf)
+    best = int(np.argmin(price[:sets]))
+    balanced, watchful = sets + 2, sets + 3
+    report.note(
+        f"{sets} random sets: {np.isfinite(price[:sets]).sum()} make nothing worse; the best of them: "
+        + ", ".join(f"{name} {values[best]:.4g}" for name, values in drawn_gains.items())
+    )
+    report.within("cost of the balanced point / of the best random set", None, 1, price[balanced] / price[best],
+                  f"{n} scenarios")  # fmt: skip
+
+    def better(i, names, others):
+        """How many of the others are at least as good as point i in both numbers."""
+        return int(np.sum(np.all([judged[name][others] <= judged[name][i] for name in names], axis=0)))
+
+    tracking, detection = ("post_q", "post_u"), ("delay", "false_alarms")
+    others = [*np.flatnonzero(kept[:sets]), sets, sets + 1]
+    report.within("random and hand-picked sets that dominate balanced", None, 0, better(balanced, tracking, others),
+                  "error and torque")  # fmt: skip
+    report.within("the same for watchful", None, 0, better(watchful, detection, [*range(sets), sets, sets + 1]),
+                  "delay and false alarms")  # fmt: skip
+    fig, axes = plt.subplots(1, 2, figsize=(11, 4.6), layout="constrained")
+    first = sets + 2 + len(TUNED)
+    lines = {tracking: range(first, first + len(TRACKING)), detection: range(first + len(TRACKING), len(price))}
+    labels = {
+        "post_q": "rms attitude error after the fault [MRP]",
+        "post_u": "rms torque after the fault [N m]",
+        "delay": "mean detection delay, never = to the end [s]",
+        "false_alarms": "share of false alarms, 5 s to the fault [1]",
+    }
+    floor = 1e-5  # where the log axis puts no false alarm at all
+    for ax, (x, y) in zip(axes, (tracking, detection)):
+        show = lambda i, y=y: np.maximum(judged[y][i], floor) if y == "false_alarms" else judged[y][i]
+        inside, outside = np.flatnonzero(kept[:sets]), np.flatnonzero(~kept[:sets])
+        if y == "post_u":
+            ax.scatter(judged[x][outside], show(outside), s=8, color="0.8", label="random, something else worse")
+        else:
+            inside = np.arange(sets)
+        ax.scatter(judged[x][inside], show(inside), s=10, color="0.45", label="random")
+        front = sorted([*lines[(x, y)], balanced if y == "post_u" else watchful], key=lambda i, x=x: judged[x][i])
+        ax.plot(judged[x][front], show(front), "o-", ms=5, color=BLUE, label="tuned, weights varied")
+        for i, marker, colour, name in (
+            (sets, "s", ORANGE, "the paper's"), (sets + 1, "D", PINK, "picked by hand"), (best, "v", "k", "best random"),
+            (balanced, "*", GREEN, "balanced"), (watchful, "P", GREEN, "watchful"),
+        ):  # fmt: skip
+            ax.scatter(judged[x][i], show(i), s=130 if marker in "*P" else 60, marker=marker, color=colour,
+                       edgecolor="w", zorder=3, label=name)  # fmt: skip
+        ax.set(xlabel=labels[x], ylabel=labels[y], xscale="log", yscale="log")
+        ax.grid(alpha=0.3)
+    axes[1].set_ylabel(f"{labels['false_alarms']}, none = {floor:g}")
+    axes[0].legend(fontsize=8)
+    report.figure("fronts", fig)
+    return {name: float(values[best]) for name, values in drawn_gains.items()}
+
+
+def verdict(report, reference: dict, found: list[dict], best_random: dict) -> None:
+    """Before and after on scenarios and noise that no number was chosen on, pair by pair."""
+    n = 1024 if report.quick else 4096
+    scenarios, key = days(VERDICT, n)
+    judge = lambda gains: hard(scored(gains, scenarios, key), scenarios)
+    before = judge(PAPER)
+    by_hand, random = judge(BY_HAND), judge(best_random)
+    source = f"{n} fresh scenarios"
+    names = list(before)
+    for label, gains in zip(TUNED, found):
+        after = judge(gains)
+        changes = {name: compare.paired_ratio(before[name], after[name], resamples=500) for name in names}
+        for name in names:
+            report.note(compare.told(f"{label}, {name}", changes[name], ratio=True))
+        if label == "balanced":
+            report.within("balanced / paper's, attitude error after the fault", None, 0.7, changes["post_q"].high,
+                          f"{source}, end of the interval")  # fmt: skip
+            report.within("balanced / paper's, torque after the fault", None, 0.8, changes["post_u"].high, source)
+            same = [changes[name].high for name in ("rms_u", "peak_u", "transient", "settling", "false_alarms")]
+            report.within(
+                "the same of what must not be worse", None, 1, same, "rms, peak, slew, settling, false alarms"
+            )
+            for other, its in (("by hand", by_hand), ("best random", random)):
+                for name in ("post_q", "post_u", "delay", "miss"):
+                    c = compare.paired_ratio(its[name], after[name], resamples=500)
+                    report.note(compare.told(f"balanced against {other}, {name}", c, ratio=True))
+                    if other == "by hand" and name in ("post_q", "post_u"):
+                        report.within(f"balanced / picked by hand, {name}", None, 1, c.high, source)
+        else:
+            report.within(f"{label} / paper's, miss share", None, 0.5, changes["miss"].high, source)
+        false = compare.paired_mean(before["false_alarms"], after["false_alarms"])
+        report.note(compare.told(f"{label}, price in false alarms", false))
+        for who, s in (("paper's", before), (label, after)):
+            k = int(np.sum(s["false_alarms"] > 0))
+            low, high = interval(k, n)
+            report.note(f"  {who}: runs with a false alarm {k / n:.4f} (95 %: {low:.4f} to {high:.4f})")
+    slews = {}
+    for label, gains in zip(("paper's", *TUNED), (PAPER, *found)):
+        log = simulate(FINE, op.params._replace(**gains), QUIET, jax.random.key(0), ticks=1500)
+        slews[label] = last_outside(norm(log.q), 0.01, 0.01) + 0.01, float(norm(log.u).max())
+        report.note(
+            f"{label}: the paper's slew settles in {slews[label][0]:.2f} s, peak torque {slews[label][1]:.2f} N m"
+        )
+    report.within(
+        "balanced: the paper's slew settles in [s]", None, slews["paper's"][0], slews["balanced"][0], "nominal"
+    )
+    report.within("balanced: its peak torque [N m]", None, slews["paper's"][1], slews["balanced"][1], "nominal")
+
+
+def way(report, history) -> None:
+    """Cost and gains of the balanced point, step by step."""
+    fig, (left, right) = plt.subplots(1, 2, figsize=(9, 3.5), layout="constrained")
+    for i, (label, colour) in enumerate(zip(TUNED, (BLUE, ORANGE))):
+        left.plot(history.cost[:, i], color=colour, ls=("-", "--")[i], label=label)
+    left.set(xlabel="step of the search", ylabel="cost on the validation scenarios", yscale="log")
+    left.legend()
+    gains = BOUNDS.within(history.theta["free"])
+    styles = zip(PAPER, (r"$\alpha$", r"$\beta$", r"$\sigma$", "$k_q$", "$k_{w0}$"),
+                 (BLUE, ORANGE, GREEN, PINK, "k"), ("-", "--", "-.", ":", (0, (5, 1))))  # fmt: skip
+    for name, label, colour, dashes in styles:
+        right.plot(gains[name][:, 0] / PAPER[name], color=colour, ls=dashes, label=label)
+    right.set(xlabel="step of the search, balanced", ylabel="gain / the paper's", yscale="log")
+    right.legend(ncols=2)
+    report.figure("way", fig)
+
+
+def budget(report, reference: dict) -> None:
+    """The balanced cost on one set of scenarios: simulations that the gradient and the baselines need."""
+    steps = 20 if report.quick else 60
+    weights = TUNED["balanced"]
+    cost = lambda free, key: cost_of(free, key, reference, weights)
+    start = BOUNDS.free(PAPER)
+    flat, unravel = jax.flatten_util.ravel_pytree(start)
+    key = jax.random.fold_in(TUNING, 1)
+    rate = optax.cosine_decay_schedule(RATE, steps, 0.05)
+    _, history = tune(cost, start, optax.adam(rate), steps, key)
+    one = jax.jit(lambda x: cost(unravel(x), key))
+    low, high = np.asarray(flat) - 1.5, np.asarray(flat) + 1.5
+    descent = compare.descent(history, compare.gradient_price(flat.size))
+    seeds = range(1) if report.quick else range(3)
+    races = compare.contest(report, descent, compare.one_by_one(one), flat, low, high,
+                            steps * compare.gradient_price(flat.size), "1", seeds)  # fmt: skip
+    del races
+
+
+# the scenario as the unknown
+
+REST = QUIET._replace(
+    q=Vec3(0.0, 0.0, 0.0), w=Vec3(0.0, 0.0, 0.0), q_hat=Vec3(0.0, 0.0, 0.0), w_hat=Vec3(0.0, 0.0, 0.0)
+)
+BIASED = jax.tree.map(float, Fault(onset=1.0, tau=5.0))
+
+
+def growing(gyro, star) -> op.Scenario:
+    """A body at rest on whose sensors offsets grow from 1 s on, with 5 s as time constant; gyro, star: (3,)."""
+    faulty = lambda sizes: Vec3(*(BIASED._replace(drift=size) for size in sizes))
+    return REST._replace(gyro=faulty(gyro), star=faulty(star))
+
+
+def degrees(mrp):
+    """The angle [deg] of an MRP of this norm."""
+    return 4 * np.degrees(np.arctan(mrp))
+
+
+def worst(report, balanced: dict) -> None:
+    """Faults found by gradient: the one that errs most without an alarm, and the onset that hurts a slew most."""
+    steps = 30 if report.quick else 80
+    quiet = jnp.zeros((250, 6))
+    fig, (left, right) = plt.subplots(1, 2, figsize=(10, 3.8), layout="constrained")
+    box = {"gyro": np.full(3, 0.1), "star": np.full(3, 0.1)}
+    silent = {}
+    for label, gains, colour in (("paper's", PAPER, ORANGE), ("balanced", balanced, BLUE)):
+        params = op.params._replace(**gains)
+
+        def harm(fault, key, params=params):
+            log = simulate(op.system, params, growing(**fault), quiet, ticks=250)
+            damage = jnp.mean(norm(log.e_q)[-20:])
+            return damage / 0.01 - 100 * penalty(jnp.max(log.xi) / params.sigma - 0.98)
+
+        low = jax.tree.map(np.negative, box)
+        rate = optax.cosine_decay_schedule(0.2, steps, 0.02)
+        fault, history = worst_case(harm, low, box, optax.adam(rate), steps, TUNING, starts=6)
+        log = simulate(op.system, params, growing(**fault), quiet, ticks=250)
+        silent[label] = degrees(float(jnp.mean(norm(log.e_q)[-20:])))
+        ends = np.sort(history.cost.max(0))
+        report.note(
+            f"{label}: silent fault, gyro {np.round(np.asarray(fault['gyro']), 4)} rad/s, star sensor "
+            f"{np.round(np.asarray(fault['star']), 4)}: {silent[label]:.2f} deg; harm of the starts {np.round(ends, 2)}"
+        )
+        report.within(f"{label}: no alarm at its worst silent fault, peak |xi| / sigma", None, 1,
+                      float(jnp.max(log.xi)) / gains["sigma"], "silent")  # fmt: skip
+        t = op.DT * np.arange(250)
+        left.plot(t, degrees(np.asarray(norm(log.e_q))), color=colour, label=f"{label} gains: error")
+        left.plot(t, 10 * np.asarray(log.xi) / gains["sigma"], color=colour, ls=":",
+                  label=f"{label} gains: residual, threshold = 10")  # fmt: skip
+    left.axhline(10, color="0.5", lw=0.8)
+    left.set(xlabel="time [s], faults grow from 1 s on", ylabel="attitude error [deg]; 10 residual / threshold",
+             title="the fault that errs most without alarm")  # fmt: skip
+    left.legend(fontsize=8)
+    report.within("worst silent error, balanced / paper's gains", None, 1, silent["balanced"] / silent["paper's"],
+                  "by gradient in the fault")  # fmt: skip
+
+    ticks, params = 150, op.params
+    noise = jnp.zeros((ticks, 6))
+    healthy = norm(simulate(op.system, params, QUIET, noise, ticks=ticks).e_q)
+
+    def lateness(fault, key):
+        way = Vec3(*fault["way"])
+        drift = (0.05 / norm(way)) * way
+        gyro = Vec3(*(Fault()._replace(onset=fault["onset"], drift=d, tau=0.5) for d in drift))
+        log = simulate(op.system, params, QUIET._replace(gyro=gyro), noise, ticks=ticks)
+        return 100 * jnp.sqrt(jnp.mean((norm(log.e_q) - healthy)[80:] ** 2))
+
+    low, high = dict(onset=0.1, way=np.full(3, -1.0)), dict(onset=12.0, way=np.full(3, 1.0))
+    fault, history = worst_case(lateness, low, high, optax.adam(0.15), steps, TUNING, starts=8)
+    grid = np.linspace(0.15, 11.9, 48)
+    along = jax.jit(jax.vmap(lambda onset: lateness(dict(onset=onset, way=fault["way"]), TUNING)))(jnp.asarray(grid))
+    right.plot(grid, along, color="0.4", label="that direction, every onset")
+    right.scatter(history.theta["onset"][-1], history.cost[-1], color=BLUE, zorder=3, label="ends of 8 ascents")
+    right.scatter(fault["onset"], history.cost.max(), s=120, marker="*", color=GREEN, zorder=4, label="worst found")
+    right.set(xlabel="onset of a gyro fault of 0.05 rad/s [s]", ylabel="rms added error, 8-15 s [0.01 MRP]",
+              title="the onset that hurts a slew most")  # fmt: skip
+    right.legend(fontsize=8)
+    report.note(
+        f"worst onset {float(fault['onset']):.2f} s: {history.cost.max():.3f}, best of the grid {along.max():.3f}"
+    )
+    report.within("harm at the worst onset found / largest on a grid", 0.99, None,
+                  float(history.cost.max() / along.max()), "48 onsets")  # fmt: skip
+    report.figure("worst", fig)

@@ -1,0 +1,141 @@
+"""Objectives: smooth terms that a cost is made of, and their weighted sum. Pure functions and tallies.
+
+Tracking and effort need none of this: ``scores.rms(log.e_q @ log.e_q, inside)`` and the like are smooth already.
+What is not smooth, alarms above all, has a surrogate here whose limit for temperature -> 0 is the real thing: tune
+on the surrogate, judge by the real thing.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxatt import scores
+from jaxatt.vec import safe_sqrt
+
+
+def weighted(terms, weights: dict):
+    """The cost: the sum of each weight times the mean of its term over all scenarios. Terms without weight are free.
+
+    terms: a dict, or a NamedTuple such as the scores of a sweep; weights: [1 / unit of the term] by name.
+
+    Raises KeyError for a weight without a term.
+    """
+    terms = terms._asdict() if hasattr(terms, "_asdict") else terms
+    return sum(weight * jnp.mean(terms[name]) for name, weight in weights.items())
+
+
+def penalty(excess):
+    """Price of a constraint excess <= 0 that is violated: its square, 0 where it holds. Smooth to first order."""
+    over = jnp.maximum(excess, 0)
+    return over * over
+
+
+# alarms
+
+
+class Delay(NamedTuple):
+    """Expected waiting time [s] for the first alarm in a window; its whole length if none is likely."""
+
+    waited: Any = 0.0  # [s]
+    silent: Any = 1.0  # [1] probability of no alarm so far
+
+    def __add__(self, later):
+        return Delay(self.waited + self.silent * later.waited, self.silent * later.silent)
+
+    def value(self):
+        return self.waited
+
+
+class Detection(NamedTuple):
+    """Smooth stand-ins of a detector's three numbers; every field is a tally of values of shape (*lanes)."""
+
+    delay: Any  # [s] from the onset to the first alarm
+    miss: Any  # [1] share of the faulty time without alarm
+    false_alarms: Any  # [1] share of alarms before the onset
+
+
+def alarm(evaluation, threshold, temperature):
+    """Probability of alarm in place of the step at the threshold; all three in the unit of the evaluation."""
+    return jax.nn.sigmoid((evaluation - threshold) / temperature)
+
+
+def detection(now, probability, onset, start=0.0) -> Detection:
+    """Tally delay, miss and false alarms of the probability of `alarm` around a fault's onset [s].
+
+    start: when false alarms begin to count [s]. The delay is 0 for an alarm at the first tick of the fault; it is one
+    tick less than `detection.soft_delay`, and can be had without keeping the run.
+    """
+    ill, quiet = now.t >= onset, (now.t < onset) & (now.t >= start)
+    silent = jnp.where(ill, 1 - probability, 1)
+    return Detection(
+        delay=Delay(jnp.where(ill, now.dt * silent, 0), silent),
+        miss=scores.mean(1 - probability, ill),
+        false_alarms=scores.mean(probability, quiet),
+    )
+
+
+# chatter
+
+
+class Chatter(NamedTuple):
+    """Root mean square change from tick to tick in a window; NaN if it held fewer than two ticks."""
+
+    total: Any = 0.0  # sum of squares of the changes
+    ticks: Any = 0.0
+    first: Any = 0.0
+    last: Any = 0.0
+
+    def __add__(self, later):
+        jump = jnp.where((self.ticks > 0) & (later.ticks > 0), later.first - self.last, 0)
+        return Chatter(
+            self.total + jump * jump + later.total,
+            self.ticks + later.ticks,
+            jnp.where(self.ticks > 0, self.first, later.first),
+            jnp.where(later.ticks > 0, later.last, self.last),
+        )
+
+    def value(self):
+        some = self.ticks > 1
+        return jnp.where(some, safe_sqrt(self.total / jnp.where(some, self.ticks - 1, 1)), jnp.nan)
+
+
+def chatter(value, inside: Any = True) -> Chatter:
+    """Tally how much a command jumps from tick to tick, over the ticks of one window: the wear of an actuator."""
+    value = jnp.asarray(value, jnp.result_type(value, 1.0))
+    there = jnp.broadcast_to(jnp.asarray(inside, value.dtype), value.shape)
+    kept = jnp.where(there > 0, value, 0)
+    return Chatter(jnp.zeros_like(value), there, kept, kept)
+
+
+# estimators
+
+
+def innovation_cost(innovation, variance, valid: Any = True):
+    """Negative log likelihood of a scalar innovation that a filter believes to be N(0, variance); 0 where not valid.
+
+    Its mean over a run is least where the filter's noise levels are the true ones: the way to tune Q and R without
+    knowing the truth. Vector measurements: add those of sequential scalar updates.
+    """
+    S = jnp.where(valid, variance, 1)
+    r = jnp.where(valid, innovation, 0)
+    return jnp.where(valid, 0.5 * (r * r / S + jnp.log(2 * jnp.pi * S)), 0)
+
+
+# stability
+
+
+def growth_rate(matrix, period, sharpness):
+    """Smooth largest growth rate [1/s] of a sampled loop: log-sum-exp of those of `linear.growth_rates`.
+
+    matrix: (..., n, n) over one period [s], of `linear.sampled`; sharpness: [s], the larger the closer: the result is
+    above the largest rate by at most log(n) / sharpness. Where two modes cross, the maximum has a corner and this has
+    none. A stable loop with margin m is ``penalty(growth_rate(...) + m)``. Differentiable but where eigenvalues
+    coincide; LAPACK, so never in a scan.
+    """
+    z = jnp.linalg.eigvals(matrix)
+    square = jnp.real(z) ** 2 + jnp.imag(z) ** 2
+    rates = jnp.log(jnp.maximum(square, 1e-300 if square.dtype == jnp.float64 else 1e-37)) / (2 * period)
+    return jax.nn.logsumexp(sharpness * rates, axis=-1) / sharpness

@@ -1,0 +1,258 @@
+"""Recorded readings through on-board code: the functions that a closed loop runs, without the loop.
+
+`replay` hands readings, one set a tick, to a loop's ``decide`` and lets its on-board flow run between the ticks. A
+closed loop gives the functions and where the board starts::
+
+    board = loop.init(loop.params, loop.scenario)[1].board
+    boards, logs = replay(loop.decide, loop.params, board, readings, dt=loop.DT)
+
+What the scenario decides of a board is its start alone: initial estimates and the like. `load` reads a CSV or Parquet
+file, which never executes code, and `resample` brings its samples to the ticks.
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxatt import check
+from jaxatt.engine import Now, compiled, like, rk4
+from jaxatt.faults import Reading
+
+EXAMPLE = Path(__file__).parent / "data" / "telemetry.csv"  # made by notebooks/telemetry.py, with a hidden fault
+SPARSE = 1000  # ticks per sample beyond which the times are taken to be wrong
+
+
+def replay(
+    decide: Callable,
+    params,
+    board,
+    readings,
+    *,
+    dt: float,
+    flow: Callable | None = None,
+    substeps: int = 1,
+    between: Any = None,
+):
+    """Run on-board code on recorded readings; returns boards and logs, time first.
+
+    decide: (params, now, board, readings) -> board, log, as in a closed loop. board: what the computer knows before
+    the first tick. readings: what ``decide`` takes, every leaf with the T ticks in its first axis and lanes, if
+    any, in its last, where the board has them too. dt: [s] between ticks; the first tick has t = 0.
+
+    flow: (params, board, readings) -> rates, a dict by name of those fields of the board that move between ticks,
+    integrated by ``substeps`` RK4 steps a tick. It sees the readings of the tick, held, unless ``between`` has
+    finer ones: leaves of shape (T, substeps, 4, ...), at the stages of each step (its start, its middle twice, its end).
+
+    boards: what the computer knew after each ``decide``; logs: what it returned. Pure: jit, grad and vmap it.
+
+    Raises ValueError for readings that disagree about T, dt <= 0 or substeps < 1; TypeError for what is no number,
+    and where ``decide`` returns a board of another structure, type or shape.
+    """
+    check.positive("dt", dt)
+    substeps = check.whole("substeps", substeps)
+    ticks = _length("readings", readings)
+    params, (board, readings, between) = check.converted(params, (board, readings, between))
+    for path, leaf in jax.tree_util.tree_leaves_with_path(between):
+        if leaf.shape[:3] != (ticks, substeps, 4):
+            name = f"between{jax.tree_util.keystr(path)}"
+            check.refuse(name, f"have shape ({ticks}, {substeps}, 4, ...)", leaf.shape)
+    operands = params, board, readings, between
+    return compiled(_replay, 4, operands)(decide, flow, float(dt), substeps, *operands)
+
+
+def _length(name: str, tree) -> int:
+    leaves = jax.tree_util.tree_leaves_with_path(tree)
+    if not leaves:
+        raise ValueError(f"`{name}` must hold at least one array, but it is empty.")
+    shapes = {name + jax.tree_util.keystr(path): np.shape(leaf) for path, leaf in leaves}
+    lengths = {shape[:1] for shape in shapes.values()}
+    first = next(iter(shapes.values()))[:1]
+    for path, shape in shapes.items():
+        if not shape or shape[:1] != first or shape[0] == 0:
+            check.refuse(
+                path,
+                "lead with the ticks, as many as the others" + (" (at least one)" * (first == (0,))),
+                f"of shape {shape}",
+            )
+    assert len(lengths) == 1
+    return first[0]
+
+
+def _replay(decide, flow, dt, substeps, params, board, readings, between):
+    dtype = check.float_type((params, board, readings))
+    h = dt / substeps
+
+    def flown(t, board, y, stages):
+        def one(x, step):
+            at, seen = step
+            stage = iter(range(4))  # rk4 asks for them in this order
+
+            def rates(t, x):
+                i = next(stage)
+                now = y if seen is None else jax.tree.map(lambda a: a[i], seen)
+                return like(flow(params, board._replace(**x), now), x, "flow")
+
+            return rk4(rates, at, x, h), None
+
+        moving = {name: getattr(board, name) for name in jax.eval_shape(flow, params, board, y)}
+        times = t + h * jnp.arange(substeps, dtype=dtype)
+        return board._replace(**jax.lax.scan(one, moving, (times, stages))[0])
+
+    @jax.checkpoint
+    def tick(board, told):
+        k, y, stages = told
+        now = Now(k, k.astype(dtype) * dt, dt)
+        after, log = decide(params, now, board, y)
+        after = like(after, board, "decide")
+        ahead = after if flow is None else flown(now.t, after, y, stages)
+        return ahead, (after, log)
+
+    ticks = jnp.arange(len(jax.tree.leaves(readings)[0]))
+    return jax.lax.scan(tick, board, (ticks, readings, between))[1]
+
+
+# files
+
+
+def load(path, units: Mapping[str, str], *, time: str = "time") -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Times (T,) [s] and channels (T,) of a ``.csv`` or ``.parquet`` file whose columns are named "gyro_a [rad/s]".
+
+    units: the unit that each channel must have, by name; other columns are left alone. Empty cells are missing
+    samples, NaN. Needs the extra ``data``.
+
+    Raises ValueError, in one line, for a missing channel, another unit, a column twice, a cell that is no number or
+    not finite, times that do not increase, and a file that cannot be read as what its name says; ImportError without
+    pandas or pyarrow.
+    """
+    path = Path(path)
+    table = _table(path)
+    there = {}
+    for name in map(str, table.columns):
+        split = re.fullmatch(r"(.*?)\s*(?:\[([^]]*)\])?", name)
+        there[split[1] if split else name] = (name, split[2] if split else None)
+    columns = {}
+    for name, unit in {time: "s", **units}.items():
+        if name not in there:
+            check.refuse(
+                f"{name} [{unit}]", f"be a column of {path.name}", "not among " + ", ".join(map(str, table.columns))
+            )
+        given, found = there[name]
+        if found != unit:
+            check.refuse(name, f"be given in [{unit}] by {path.name}", f"in the column {given!r}")
+        columns[name] = _numbers(given, table[given])
+    return checked(columns.pop(time), columns)
+
+
+def _table(path: Path):
+    try:
+        import pandas
+        import pyarrow.parquet
+    except ImportError as error:
+        raise ImportError("Reading files needs pandas and pyarrow: pip install 'jaxatt[data]'.") from error
+    kind = path.suffix.lower()
+    if kind not in (".csv", ".parquet"):
+        check.refuse("path", "end in .csv or .parquet", repr(path.name))
+    with path.open("rb") as file:  # an open file: pandas fetches no address and unpacks nothing
+        try:
+            if kind == ".parquet":
+                return pyarrow.parquet.read_table(file).to_pandas(ignore_metadata=True)
+            header = next(csv.reader([file.readline().decode("utf-8-sig").strip()]), [])
+            if len(set(header)) < len(header):
+                check.refuse("path", "name every column once", f"{path.name} with {sorted(header)}")
+            names = [name.strip() for name in header]
+            return pandas.read_csv(file, header=None, names=names, index_col=False, float_precision="round_trip")
+        except (
+            pandas.errors.ParserError,
+            pandas.errors.EmptyDataError,
+            pyarrow.ArrowInvalid,
+            UnicodeDecodeError,
+        ) as error:
+            reason = str(error).splitlines()[0]
+            raise ValueError(f"`path` must be a {kind[1:]} file, but {path.name} is none: {reason}") from error
+
+
+def _numbers(name: str, column) -> np.ndarray:
+    try:
+        return np.asarray(column, float)
+    except (TypeError, ValueError):
+        for row, cell in enumerate(column):
+            try:
+                float(cell)
+            except (TypeError, ValueError):
+                check.refuse(name, "hold numbers", f"{cell!r} in row {row}")
+        raise
+
+
+def checked(t, columns: Mapping[str, Any]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Times and channels of one length as float arrays; NaN in a channel is a missing sample.
+
+    Raises ValueError for times that are not finite or do not increase, infinite samples, a channel without any
+    sample, and lengths that differ. Rows are counted from 0.
+    """
+    t = np.asarray(t, float)
+    if t.ndim != 1 or not len(t):
+        check.refuse("time", "have shape (T,) with at least one sample", f"of shape {t.shape}")
+    if not np.isfinite(t).all():
+        row = int(np.flatnonzero(~np.isfinite(t))[0])
+        check.refuse("time", "be finite", f"{t[row]:g} in row {row}")
+    if (np.diff(t) <= 0).any():
+        row = int(np.flatnonzero(np.diff(t) <= 0)[0]) + 1
+        check.refuse("time", "increase from row to row", f"{t[row]:.9g} after {t[row - 1]:.9g} in row {row}")
+    out = {}
+    for name, values in columns.items():
+        out[name] = a = np.asarray(values, float)
+        if a.shape != t.shape:
+            check.refuse(name, f"have the shape {t.shape} of the times", a.shape)
+        if np.isinf(a).any():
+            row = int(np.flatnonzero(np.isinf(a))[0])
+            check.refuse(name, "be finite, or NaN where a sample is missing", f"{a[row]:g} in row {row}")
+        if np.isnan(a).all():
+            check.refuse(name, "hold at least one sample", "missing in every row")
+    return t, out
+
+
+def resample(t, columns: Mapping[str, Any], *, dt: float, ticks: int | None = None) -> dict[str, Reading]:
+    """Irregular samples brought to ticks: a `Reading` of shape (ticks,) for each channel.
+
+    Tick k stands for the time t[0] + k dt. It takes the sample nearest to it and at most dt / 2 away; where there is
+    none, or it is NaN, the reading is not valid and repeats the last valid one (before the first, it gives the first).
+    ticks: how many; None: up to the last sample.
+
+    Raises what `checked` raises, and ValueError for dt <= 0, ticks < 1 and times that span more than `SPARSE` ticks
+    for each sample.
+    """
+    check.positive("dt", dt)
+    t, columns = checked(t, columns)
+    span = (t[-1] - t[0]) / dt
+    if span > SPARSE * len(t):
+        check.refuse(
+            "time", f"span at most {SPARSE} ticks of {dt:g} s for each sample", f"{len(t)} samples in {span:.3g} ticks"
+        )
+    ticks = round(span) + 1 if ticks is None else check.whole("ticks", ticks)
+    out = {}
+    for name, a in columns.items():
+        known = np.isfinite(a)
+        place = (t[known] - t[0]) / dt
+        tick = np.floor(place + 0.5).astype(int)
+        order = np.argsort(-np.abs(place - tick), kind="stable")  # the nearest is written last
+        order = order[tick[order] < ticks]
+        sample = np.full(ticks, -1)
+        sample[tick[order]] = order
+        valid = sample >= 0
+        last = np.maximum.accumulate(np.where(valid, np.arange(ticks), -1))
+        held = np.where(last >= 0, sample[last], 0)
+        out[name] = Reading(a[known][held], valid)
+    return out
+
+
+def together(readings: Mapping[str, Reading], names) -> Reading:
+    """Channels as one reading of shape (ticks, channels), in the order of the names."""
+    return jax.tree.map(lambda *a: np.stack(a, axis=1), *(readings[name] for name in names))

@@ -1,0 +1,110 @@
+"""Smooth terms of a cost: their limits, and their gradients."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxatt import Fault, linear, on_axes, scores, sweep
+from jaxatt import objectives as ob
+from jaxatt.detection import soft_delay
+from jaxatt.engine import Now
+from jaxatt.systems import observer_pd as op
+
+RNG = np.random.default_rng(3)
+DT = 0.1
+
+
+def told(tally, *signals):
+    """The value of a tally function (now, *values) summed over the ticks of signals, shape (ticks, n)."""
+    total = None
+    for k, values in enumerate(zip(*signals)):
+        one = tally(Now(k, DT * k, DT), *map(jnp.asarray, values))
+        total = one if total is None else scores.add(total, one)
+    return scores.values(total)
+
+
+def test_weights_are_explicit():
+    class Terms(NamedTuple):
+        a: object
+        b: object
+
+    assert ob.weighted(Terms(np.array([1.0, 3.0]), 7.0), {"a": 2.0}) == 4
+    assert ob.weighted({"a": 1.0, "b": np.array([2.0, 4.0])}, {"a": 1.0, "b": 0.5}) == 2.5
+    with pytest.raises(KeyError):
+        ob.weighted({"a": 1.0}, {"c": 1.0})
+    np.testing.assert_allclose(ob.penalty(np.array([-1.0, 0.0, 2.0])), [0, 0, 4])
+
+
+def test_soft_detection_tends_to_the_real_one():
+    evaluation = np.abs(RNG.normal(size=(60, 8))) + 1.5 * (np.arange(60) > 40)[:, None]
+    onset, start = 3.05, 0.45
+    for temperature, tolerance in ((0.2, 1.0), (1e-6, 1e-9)):
+        soft = told(lambda now, x, t=temperature: ob.detection(now, ob.alarm(x, 2.0, t), onset, start), evaluation)
+        alarms, t = evaluation > 2.0, DT * np.arange(60)
+        ill, quiet = t >= onset, (t < onset) & (t >= start)
+        first = np.where(alarms[ill].any(0), DT * alarms[ill].argmax(0), DT * ill.sum())
+        assert np.abs(soft.delay - first).max() <= tolerance
+        assert np.abs(soft.miss - (~alarms[ill]).mean(0)).max() <= tolerance / 5
+        assert np.abs(soft.false_alarms - alarms[quiet].mean(0)).max() <= tolerance / 5
+    p = ob.alarm(evaluation[31:], 2.0, 0.2)
+    delay = told(lambda now, x: ob.detection(now, x, 0.0), p).delay
+    np.testing.assert_allclose(delay, soft_delay(jnp.concatenate([p, p[:1]]), DT) - DT, rtol=1e-12)
+
+
+def test_chatter_is_the_rms_of_the_jumps_in_one_window():
+    u = RNG.normal(size=(30, 4))
+    got = told(lambda now, x: ob.chatter(x, now.t > 0.95), u)
+    np.testing.assert_allclose(got, np.sqrt((np.diff(u[10:], axis=0) ** 2).mean(0)), rtol=1e-12)
+    assert np.isnan(told(lambda now, x: ob.chatter(x, now.t > 2.85), u)).all()  # one tick has no jump
+    gradient = jax.grad(lambda u: told(lambda now, x: ob.chatter(x), [u, u, u]))(1.0)
+    assert gradient == 0  # a resting command: no NaN
+
+
+def test_tallies_go_through_a_sweep():
+    def score(params, scenario, now, log):
+        p = ob.alarm(log.xi, params.sigma, 0.1 * params.sigma)
+        return ob.detection(now, p, scenario.gyro.x.onset), ob.chatter(log.u.x)
+
+    scenario = op.scenario._replace(gyro=on_axes(Fault(2.0, bias=0.05)), star=on_axes(Fault()))
+    scenarios = jax.tree.map(lambda a: np.full(3, a), scenario)
+    found, jumps = sweep(op.system, op.params, scenarios, jax.random.key(0), ticks=30, score=score)
+    assert found.delay.max() < 0.2 and found.miss.max() < 0.1 and (jumps > 0.1).all()
+
+
+def test_the_innovation_cost_is_least_at_the_true_variance():
+    truth = 2.3
+    r = np.sqrt(truth) * RNG.normal(size=200_000)
+    cost = lambda variance: jnp.mean(ob.innovation_cost(r, variance))
+    assert cost(np.mean(r * r)) == pytest.approx(0.5 * (1 + np.log(2 * np.pi * np.mean(r * r))), rel=1e-12)
+    assert jax.grad(cost)(float(np.mean(r * r))) == pytest.approx(0, abs=1e-12)
+    assert cost(truth) < min(cost(0.9 * truth), cost(1.1 * truth))
+    missing = jax.grad(lambda s: jnp.sum(ob.innovation_cost(jnp.array([jnp.nan, 1.0]), s, jnp.array([False, True]))))
+    assert missing(1.0) == 0
+
+
+def test_the_smooth_growth_rate_bounds_the_largest_one():
+    A = RNG.normal(size=(20, 6, 6))
+    step = np.array([linear._exponential(0.1 * a) for a in A])
+    largest = linear.growth_rates(step, 0.1)[:, 0]
+    np.testing.assert_allclose(largest, np.linalg.eigvals(A).real.max(-1), rtol=1e-8)
+    for sharpness in (1.0, 100.0):
+        smooth = ob.growth_rate(step, 0.1, sharpness)
+        assert (smooth >= largest - 1e-12).all() and (smooth <= largest + np.log(6) / sharpness).all()
+    rate = lambda c: ob.growth_rate(jnp.asarray(step[0]) + c * jnp.eye(6), 0.1, 5.0)
+    assert jax.grad(rate)(0.02) == pytest.approx(float((rate(0.02 + 1e-5) - rate(0.02 - 1e-5)) / 2e-5), rel=1e-7)
+
+
+def test_the_margins_of_the_papers_proof():
+    """Spec, 4 and 5.7: k_q = 330 needs eps > 0.00303032; T_I at the start is 31.7 for eps = 0.1, -0.0206 for 0.00304."""
+    largest, q, w = 31.8566039, 0.76533, 1.30721
+    m = op.margins(op.params, largest, q, w)
+    assert abs(m.T - 31.7) < 0.05 and m.eps == pytest.approx(0.354348 - 0.1, abs=1e-6)
+    assert abs(op.margins(op.params._replace(eps=0.00304), largest, q, w).T + 0.0206) < 1e-4
+    assert op.margins(op.params._replace(eps=0.00303032), largest).k_q == pytest.approx(0, abs=2e-3)
+    low = op.margins(op.params._replace(k_w0=1.0), largest, q, w)
+    assert low.T < 0
+    gradient = jax.grad(lambda k: op.margins(op.params._replace(k_w0=k), largest, q, w).T)
+    assert gradient(1.0) > 0 and gradient(125.0) > 0  # towards larger rate gains from either side of the floor

@@ -1,0 +1,364 @@
+"""Recorded readings through on-board code: the same board as in the closed loop, and a door for files."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas
+import pytest
+
+from jaxatt import Now, Reading, Vec3, rk4, simulate
+from jaxatt.estimators import AttitudeRate
+from jaxatt.replay import checked, load, replay, resample, together
+from jaxatt.sensors import read_triad
+from jaxatt.systems import cmg_loss, gyro_ekf, observer_pd, star_isolation, wheel_mrac
+
+KEY = jax.random.key(4)
+TICKS = 120
+
+# replay is the run
+
+
+class Case(NamedTuple):
+    """A closed loop, and what its sensors say."""
+
+    loop: Any  # module
+    system: Any
+    decide: Any
+    scenario: Any
+    told: Any  # (scenario, now, x, z before, z after, noise) -> readings of a tick
+    flow: Any = None
+    moving: tuple = ()  # fields of x that are the board's
+    read: Any = None  # (scenario, x, z) -> readings between ticks
+
+
+def observer_reads(scenario, x, z):
+    return AttitudeRate(read_triad(z.sensors.star, x.q), read_triad(z.sensors.gyro, x.w))
+
+
+def wheel_reads(scenario, x, z):
+    y = wheel_mrac.tachometer(scenario, z.sensors.tacho, x.y)
+    return wheel_mrac.Readings(z.sensors.readings.theta, y)
+
+
+OBSERVER = observer_pd.scenario._replace(
+    gyro=Vec3(*(f._replace(onset=4.0) for f in observer_pd.scenario.gyro)),
+    star=Vec3(*(f._replace(onset=8.0) for f in observer_pd.scenario.star)),
+)
+EKF = gyro_ekf.scenario._replace(gyro=gyro_ekf.failed([False, True, False, False], 5.0))
+STAR = star_isolation.scenario._replace(
+    star=jax.tree.map(lambda a: np.where(a == 100.0, 6.0, a), star_isolation.scenario.star)
+)
+CMG = cmg_loss.scenario._replace(std_w=1e-4)
+WHEEL = wheel_mrac.scenario._replace(tacho_noise=1.0, drive=wheel_mrac.Fault(onset=1.0, scale=0.5))
+sees = lambda module: lambda s, now, x, z, after, noise: module.sense(module.params, s, now, x, z, noise)
+CASES = {
+    "observer_pd": Case(observer_pd, observer_pd.system, observer_pd.decide, OBSERVER,
+                        lambda s, now, x, z, after, noise: after.sensors.y, observer_pd.board_flow, ("estimate",), observer_reads),
+    "gyro_ekf": Case(gyro_ekf, gyro_ekf.system, gyro_ekf.decide, EKF, sees(gyro_ekf)),
+    "cmg_loss": Case(cmg_loss, cmg_loss.system, cmg_loss.decide, CMG, sees(cmg_loss)),
+    "star_isolation": Case(star_isolation, star_isolation.system, star_isolation.decide, STAR,
+                           lambda s, now, x, z, after, noise: after.sensors.readings),
+    "wheel_mrac": Case(wheel_mrac, wheel_mrac.system, wheel_mrac.decide, WHEEL,
+                       lambda s, now, x, z, after, noise: after.sensors.readings, wheel_mrac.board_flow, ("mrac", "turns"), wheel_reads),
+    "wheel_mrac, sampled": Case(wheel_mrac, wheel_mrac.sampled, wheel_mrac.decide_sampled, WHEEL,
+                                lambda s, now, x, z, after, noise: after.sensors.readings,
+                                wheel_mrac.board_flow_sampled, ("mrac", "turns"), wheel_reads),
+}  # fmt: skip
+
+
+class Run(NamedTuple):
+    """What a closed loop was told and remembered."""
+
+    start: Any  # board before the first tick
+    told: Any  # readings at the ticks
+    between: Any  # at every stage of RK4; None where nothing moves on board
+    boards: Any  # after each decide
+    log: Any
+
+
+def recorded(case, ticks=TICKS) -> Run:
+    """A closed loop run by the engine; where the board flows, written down once more to see its readings there."""
+    system, params, scenario = case.system, case.loop.params, jax.tree.map(jnp.asarray, case.scenario)
+    noise = jax.random.normal(KEY, (ticks, system.normals))
+
+    def tick(params, scenario, now, x, z, n):
+        x_after, after, log = system.tick(params, scenario, now, x, z, n)
+        moving = {name: getattr(x_after, name) for name in case.moving}
+        return x_after, after, (case.told(scenario, now, x, z, after, n), after.board._replace(**moving), log)
+
+    start = jax.tree.map(lambda a: jnp.asarray(a, jnp.result_type(a)), system.init(params, scenario))
+    if not case.flow:
+        told, boards, log = simulate(system._replace(tick=tick), params, scenario, noise, ticks=ticks)
+        return Run(start[1].board, told, None, boards, log)
+    h = system.dt / system.substeps
+
+    def step(state, kn):
+        now = Now(kn[0], kn[0] * system.dt, system.dt)
+        x, z, out = tick(params, scenario, now, *state, kn[1])
+
+        def substep(x, t):
+            seen = []
+
+            def flow(t, x):
+                seen.append(case.read(scenario, x, z))
+                return system.flow(params, scenario, t, x, z)
+
+            return rk4(flow, t, x, h), jax.tree.map(lambda *a: jnp.stack(a), *seen)
+
+        x, between = jax.lax.scan(substep, x, now.t + h * jnp.arange(system.substeps))
+        return (x, z), (*out, between)
+
+    told, boards, log, between = jax.jit(lambda: jax.lax.scan(step, start, (jnp.arange(ticks), noise))[1])()
+    return Run(start[1].board, told, between, boards, log)
+
+
+@pytest.fixture(scope="module", params=CASES)
+def run(request):
+    """A case, its run, and the boards and words of the replay."""
+    case = CASES[request.param]
+    run = recorded(case)
+    grid = dict(dt=case.system.dt, flow=case.flow, substeps=case.system.substeps, between=run.between)
+    return case, run, *replay(case.decide, case.loop.params, run.start, run.told, **grid)
+
+
+def close(a, b, rtol=1e-9):
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        x, y = np.asarray(x), np.asarray(y)
+        if x.dtype.kind in "bi":
+            np.testing.assert_array_equal(x, y)
+        else:
+            np.testing.assert_allclose(x, y, rtol=rtol, atol=rtol * max(np.abs(x).max(), 1e-30))
+
+
+def test_the_board_of_a_replay_is_that_of_the_closed_loop(run):
+    _, run, boards, _ = run
+    close(run.boards, boards)
+
+
+def test_so_is_what_it_says(run):
+    case, (*_, log), boards, said = run
+    if case.loop is observer_pd:
+        close((log.xi, log.alarm), said)
+        assert log.alarm[40:].all() and not log.alarm[:40].all()
+    elif case.loop is star_isolation:
+        close(log.board, said)
+        assert log.board.latched[-1].tolist() == [True, False]
+    elif case.loop is wheel_mrac:
+        close((log.residual, log.alarm, log.flipped), said)
+        assert log.alarm[60:].any() and log.alarm[:25].sum() < 25
+    elif case.decide is gyro_ekf.decide:
+        (met, suspicion), f = said, log.filter
+        close((f.nis, f.rows, f.nll, f.statistic, f.parity), (*met, suspicion.gyro, suspicion.parity))
+    else:
+        close(log.u, jnp.clip(boards.u, -1, 1) * np.array([1, 1, 1, 0]))
+
+
+def test_the_loop_written_down_once_more_is_the_shipped_one():
+    case = CASES["observer_pd"]
+    noise = jax.random.normal(KEY, (TICKS, case.system.normals))
+    close(simulate(case.system, case.loop.params, case.scenario, noise, ticks=TICKS), recorded(case).log)
+
+
+class Lag(NamedTuple):
+    x: Any
+
+
+def lag(k, **how):
+    """A lag of 1 s behind sin(k t), told every 0.1 s for 3 s."""
+    t = 0.1 * np.arange(31)
+    flow = lambda params, board, y: dict(x=y - board.x)
+    boards, _ = replay(lambda params, now, board, y: (board, ()), (), Lag(0.0), np.sin(k * t), dt=0.1, flow=flow, **how)
+    return t, np.asarray(boards.x)
+
+
+def test_readings_are_held_between_ticks():
+    t, x = lag(3.0)
+    expected = [0.0]
+    for y in np.sin(3 * t[:-1]):
+        expected.append(y + (expected[-1] - y) * (1 - 0.1 + 0.1**2 / 2 - 0.1**3 / 6 + 0.1**4 / 24))  # RK4's exp(-0.1)
+    np.testing.assert_allclose(x, expected, atol=1e-12)
+
+
+def test_finer_readings_are_used_where_there_are_some():
+    stages = 0.1 * np.arange(31)[:, None, None] + 0.05 * (np.arange(2)[:, None] + np.array([0, 0.5, 0.5, 1]))
+    t, x = lag(3.0, substeps=2, between=np.sin(3 * stages))
+    np.testing.assert_allclose(x, (np.sin(3 * t) - 3 * np.cos(3 * t) + 3 * np.exp(-t)) / 10, atol=1e-6)
+
+
+def test_lanes_maps_and_gradients_go_through():
+    told = np.random.default_rng(1).normal(size=(20, 3))
+    decide = lambda params, now, board, y: (board + params * (y - board), now.t)
+    run = lambda told, start, params=0.3: replay(decide, params, start, told, dt=0.1)
+    lanes, t = run(told, np.zeros(3))
+    np.testing.assert_allclose(t, 0.1 * np.arange(20), atol=1e-15)
+    mapped = jax.vmap(run, (1, 0), (1, None))(told, np.zeros(3))[0]
+    for i in range(3):
+        np.testing.assert_allclose(run(told[:, i], 0.0)[0], lanes[:, i], rtol=1e-14)
+        np.testing.assert_allclose(mapped[:, i], lanes[:, i], rtol=1e-14)
+    end = lambda params: run(told[:, 0], 0.0, params)[0][-1]
+    assert jax.grad(end)(0.3) == pytest.approx(float(end(0.3 + 1e-6) - end(0.3 - 1e-6)) / 2e-6, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (dict(dt=0.0), "`dt` must be a positive number"),
+        (dict(substeps=0), "`substeps` must be a whole number"),
+        (dict(readings={"a": np.ones(3), "b": np.ones(4)}), r"`readings\['b'\]` must lead with the ticks.*\(4,\)"),
+        (dict(readings=()), "`readings` must hold at least one array"),
+        (dict(readings={"a": np.ones(0)}), "at least one"),
+        (dict(between={"a": np.ones((3, 1, 3))}), r"`between\['a'\]` must have shape \(3, 1, 4"),
+    ],
+)  # fmt: skip
+def test_bad_recordings_are_refused(change, message):
+    given = dict(readings={"a": np.ones(3)}, dt=0.1) | change
+    decide = lambda params, now, board, y: (board + y["a"], board)
+    with pytest.raises(ValueError, match=message):
+        replay(decide, (), 0.0, **given)
+
+
+def test_a_board_that_changes_its_kind_is_refused():
+    with pytest.raises(TypeError, match="`decide` must return"):
+        replay(lambda params, now, board, y: ((board, y), ()), (), 0.0, np.ones(3), dt=0.1)
+
+
+# samples
+
+
+def test_samples_go_to_the_nearest_tick_and_gaps_are_not_valid():
+    t = np.array([10.0, 10.11, 10.19, 10.22, 10.7, 10.81])
+    got = resample(t, {"a": np.arange(6.0)}, dt=0.1)["a"]
+    assert got.value.tolist() == [0, 1, 2, 2, 2, 2, 2, 4, 5]
+    assert got.valid.tolist() == [True, True, True, False, False, False, False, True, True]
+
+
+def test_missing_samples_are_gaps_of_their_channel():
+    t, nan = 0.5 * np.arange(4), np.nan
+    got = resample(t, {"a": np.array([nan, 1.0, nan, 3.0]), "b": np.arange(4.0)}, dt=0.5)
+    assert got["a"].value.tolist() == [1, 1, 1, 3] and got["a"].valid.tolist() == [False, True, False, True]
+    assert got["b"].valid.all()
+    both = together(got, ["b", "a"])
+    assert both.value.tolist() == [[0, 1], [1, 1], [2, 1], [3, 3]] and both.valid.shape == (4, 2)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_jitter_within_half_a_tick_loses_no_sample(seed):
+    rng = np.random.default_rng(seed)
+    ticks = np.arange(200)
+    t = 1e6 + 0.02 * (ticks + rng.uniform(-0.49, 0.49, 200) * (ticks > 0))
+    got = resample(t, {"a": 1.0 * ticks}, dt=0.02, ticks=200)["a"]
+    assert got.valid.all() and got.value.tolist() == ticks.tolist()
+
+
+def test_more_samples_than_ticks_and_fewer():
+    t = 0.01 * np.arange(100)
+    got = resample(t, {"a": t}, dt=0.1, ticks=5)["a"]
+    np.testing.assert_allclose(got.value, 0.1 * np.arange(5), atol=1e-12)
+    assert resample(t, {"a": t}, dt=0.1, ticks=30)["a"].valid.tolist() == [True] * 11 + [False] * 19
+
+
+@pytest.mark.parametrize(
+    ("t", "a", "message"),
+    [
+        ([0, 1, 1, 2], None, "`time` must increase from row to row, but it is 1 after 1 in row 2"),
+        ([0, 2, 1, 3], None, "`time` must increase from row to row, but it is 1 after 2 in row 2"),
+        ([0, 1, np.nan, 3], None, "`time` must be finite, but it is nan in row 2"),
+        ([], None, "`time` must have shape"),
+        (None, [0, 1, np.inf, 3], "`a` must be finite, or NaN where a sample is missing, but it is inf in row 2"),
+        (None, [np.nan] * 4, "`a` must hold at least one sample"),
+        (None, [1.0, 2.0], r"`a` must have the shape \(4,\) of the times"),
+        ([0, 1e3, 2e3, 3e6], None, "`time` must span at most 1000 ticks"),
+    ],
+)  # fmt: skip
+def test_times_and_samples_that_cannot_be_are_refused(t, a, message):
+    t = np.arange(4.0) if t is None else np.array(t, float)
+    with pytest.raises(ValueError, match=message) as refusal:
+        resample(t, {"a": np.ones(len(t)) if a is None else a}, dt=0.5)
+    assert "\n" not in str(refusal.value)
+
+
+# files
+
+TABLE = {"time [s]": [0.0, 0.5, 1.0], "gyro_a [rad/s]": [0.1, 0.2, 0.30000000000000004], "note": ["x", "y", "z"]}
+
+
+def written(path, columns):
+    frame = pandas.DataFrame(columns)
+    frame.to_csv(path, index=False) if path.suffix == ".csv" else frame.to_parquet(path)
+    return path
+
+
+@pytest.mark.parametrize("kind", ["csv", "parquet"])
+def test_files_are_read_to_the_last_bit(tmp_path, kind):
+    t, columns = load(written(tmp_path / f"a.{kind}", TABLE), {"gyro_a": "rad/s"})
+    assert t.tolist() == TABLE["time [s]"] and list(columns) == ["gyro_a"]
+    assert columns["gyro_a"].tolist() == TABLE["gyro_a [rad/s]"]
+
+
+def test_an_empty_cell_is_a_missing_sample(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("time [s],gyro_a [rad/s]\n0,1\n1,\n2,NaN\n")
+    _, columns = load(path, {"gyro_a": "rad/s"})
+    np.testing.assert_array_equal(columns["gyro_a"], [1, np.nan, np.nan])
+
+
+BAD = {
+    "a missing channel": ("time [s],gyro_b [rad/s]\n0,1\n", r"`gyro_a \[rad/s\]` must be a column of a.csv.*gyro_b"),
+    "another unit": ("time [s],gyro_a [deg/s]\n0,1\n", r"`gyro_a` must be given in \[rad/s\].*deg/s"),
+    "no unit": ("time [s],gyro_a\n0,1\n", r"`gyro_a` must be given in \[rad/s\]"),
+    "time in ms": ("time [ms],gyro_a [rad/s]\n0,1\n", r"`time` must be given in \[s\]"),
+    "no time": ("t [s],gyro_a [rad/s]\n0,1\n", r"`time \[s\]` must be a column"),
+    "words": ("time [s],gyro_a [rad/s]\n0,1\n1,off\n", r"`gyro_a \[rad/s\]` must hold numbers, but it is 'off' in row 1"),
+    "a column twice": ("time [s],gyro_a [rad/s],gyro_a [rad/s]\n0,1,2\n", "`path` must name every column once"),
+    "a row too long": ("time [s],gyro_a [rad/s]\n0,1\n1,2,3\n", "`path` must be a csv file"),
+    "nothing": ("", "`time \\[s\\]` must be a column|`path` must be a csv file"),
+    "no rows": ("time [s],gyro_a [rad/s]\n", "`time` must have shape|`path` must be a csv file"),
+    "a time twice": ("time [s],gyro_a [rad/s]\n0,1\n0,1\n", "`time` must increase"),
+    "times out of order": ("time [s],gyro_a [rad/s]\n1,1\n0,1\n", "`time` must increase"),
+    "a time missing": ("time [s],gyro_a [rad/s]\n0,1\n,1\n", "`time` must be finite"),
+    "an infinity": ("time [s],gyro_a [rad/s]\n0,1\n1,inf\n", "`gyro_a` must be finite"),
+    "an empty channel": ("time [s],gyro_a [rad/s]\n0,\n1,\n", "`gyro_a` must hold at least one sample"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", BAD)
+def test_a_bad_file_is_refused_in_one_line(tmp_path, what):
+    text, message = BAD[what]
+    path = tmp_path / "a.csv"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=message) as refusal:
+        load(path, {"gyro_a": "rad/s"})
+    assert "\n" not in str(refusal.value)
+
+
+def test_no_file_runs_code(tmp_path):
+    touched = tmp_path / "touched"
+
+    class Trap:
+        def __reduce__(self):
+            return touched.touch, ()
+
+    for name in ("a.pkl", "a.npy", "a.npz"):
+        path = tmp_path / name
+        pandas.to_pickle(Trap(), path, compression=None)
+        with pytest.raises(ValueError, match=r"`path` must end in \.csv or \.parquet"):
+            load(path, {})
+    for name in ("a.csv", "a.parquet"):
+        (tmp_path / name).write_bytes((tmp_path / "a.pkl").read_bytes())
+        with pytest.raises(ValueError, match=r"`time|`path"):
+            load(tmp_path / name, {})
+    assert not touched.exists()
+
+
+def test_without_pandas_the_extra_is_named(monkeypatch, tmp_path):
+    monkeypatch.setitem(__import__("sys").modules, "pandas", None)
+    with pytest.raises(ImportError, match=r"pip install 'jaxatt\[data\]'"):
+        load(tmp_path / "a.csv", {})
+
+
+def test_arrays_need_no_file():
+    t, columns = checked([0, 1], {"a": [1, np.nan]})
+    assert t.dtype == float and np.isnan(columns["a"][1])
+    assert isinstance(resample(t, columns, dt=1.0)["a"], Reading)
