@@ -345,7 +345,7 @@ def worst_case(
     check.finite("low", low)
     check.finite("high", high)
     bounds = bounded(low, high)
-    flat, unravel = ravel_pytree(_floats(low))
+    flat, unravel = ravel_pytree(_floats("low", low))
     shares = jax.random.uniform(jax.random.fold_in(key, starts), (starts, flat.size), flat.dtype, 0.05, 0.95)
     thetas = jax.vmap(unravel)(jnp.log(shares / (1 - shares)))
     cost = lambda free, key: -harm(bounds.within(free), key)
@@ -374,7 +374,7 @@ def gradient_check(cost: Callable, theta, key, *, step: float | None = None, for
 
     Raises TypeError if the cost is no scalar.
     """
-    theta = _floats(theta)
+    theta = _floats("theta", theta)
     flat, unravel = ravel_pytree(theta)
     slopes = compiled(lambda theta, key: value_and_gradient(cost, theta, key, forward=forward)[1], 0)
     gradient = np.asarray(ravel_pytree(slopes(theta, key))[0])
