@@ -169,7 +169,7 @@ def converted(params, scenario) -> tuple[Any, Any]:
     Python numbers become floats; integer and bool arrays stay what they are. Raises TypeError for a leaf that
     is no number, or one of another size than 32 or 64 bits.
     """
-    dtype = float_type((_numbers("params", params), _numbers("scenario", scenario)))
+    dtype = float_type((numbers("params", params), numbers("scenario", scenario)))
 
     def convert(leaf):
         kind = getattr(leaf, "dtype", bool if isinstance(leaf, bool) else dtype)
@@ -180,7 +180,8 @@ def converted(params, scenario) -> tuple[Any, Any]:
     return jax.tree.map(convert, params), jax.tree.map(convert, scenario)
 
 
-def _numbers(name: str, tree):
+def numbers(name: str, tree):
+    """The tree, if all of its leaves are numbers, floats of 32 or 64 bits; TypeError, by the leaf's path, if not."""
     for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
         if not is_number(leaf):
             raise TypeError(

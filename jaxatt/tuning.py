@@ -22,7 +22,7 @@ from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh, PartitionSpec
 
 from jaxatt import check
-from jaxatt.engine import compiled, raw_key
+from jaxatt.engine import compiled, one_key
 from jaxatt.study import _bar
 
 FEW = 6  # numbers up to which forward mode is the cheaper
@@ -101,7 +101,9 @@ def tune(
     Raises ValueError if the cost is not finite at the start, for steps < 1 or fewer than the file holds, and for a
     file of another search (cost, start, optimizer, key or release of JAX); TypeError if the cost is no scalar.
     """
-    theta = _floats(theta)
+    check.function("cost", cost)
+    check.function("optimizer.update", getattr(optimizer, "update", None))
+    steps, key, theta = check.whole("steps", steps), one_key(key), _floats("theta", theta)
     step = lambda search, key, k: _step(cost, optimizer, forward, fresh, search, key, k)
     best, history = _run(step, _start(optimizer, theta), steps, key, save, progress)
     return best.theta, history
@@ -118,7 +120,7 @@ def multi_start(
 
     Raises what `tune` raises, for the start only if no start is finite.
     """
-    thetas = _floats(thetas)
+    thetas = _floats("thetas", thetas)
     sizes = {np.shape(leaf)[:1] for leaf in jax.tree.leaves(thetas)}
     if len(sizes) != 1 or () in sizes or (0,) in sizes:
         check.refuse("thetas", "lead with the same number of starts in every leaf", f"with {sorted(sizes)}")
@@ -136,7 +138,9 @@ def best_of(history: History):
     return jax.tree.map(lambda a: a[at], history.theta), finite[at]
 
 
-def _floats(theta):
+def _floats(name: str, theta):
+    if not jax.tree.leaves(check.numbers(name, theta)):
+        raise TypeError(f"`{name}` must hold at least one number, but it is {check.short(theta)}.")
     return jax.tree.map(lambda a: jnp.asarray(a, jnp.result_type(a, float)), theta)
 
 
@@ -171,7 +175,7 @@ def _step(cost, optimizer, forward, fresh: bool, search: _Search, key, k):
 def _run(step: Callable, search: _Search, steps: int, key, save, progress) -> tuple[_Best, History]:
     """All steps, one compiled call each, so that a bar can move and a file can follow."""
     steps = check.whole("steps", steps)
-    key = jax.random.wrap_key_data(jnp.asarray(raw_key(key)))
+    key = jax.random.wrap_key_data(jnp.asarray(one_key(key)))
     search = jax.device_get(search)
     lowered = compiled(step, 0).lower(search, key, np.int32(0))
     trail: list[History] = []
@@ -355,7 +359,7 @@ def worst_case(
     check.finite("low", low)
     check.finite("high", high)
     bounds = bounded(low, high)
-    flat, unravel = ravel_pytree(_floats(low))
+    flat, unravel = ravel_pytree(_floats("low", low))
     shares = jax.random.uniform(jax.random.fold_in(key, starts), (starts, flat.size), flat.dtype, 0.05, 0.95)
     thetas = jax.vmap(unravel)(jnp.log(shares / (1 - shares)))
     cost = lambda free, key: -harm(bounds.within(free), key)
@@ -384,7 +388,7 @@ def gradient_check(cost: Callable, theta, key, *, step: float | None = None, for
 
     Raises TypeError if the cost is no scalar.
     """
-    flat, unravel = ravel_pytree(_floats(theta))
+    flat, unravel = ravel_pytree(_floats("theta", theta))
     at = lambda flat, key: cost(unravel(flat), key)
     if flat.size <= FEW if forward is None else forward:  # one compilation, the directions one by one
         along = lambda flat, way, key: jax.jvp(lambda a: at(a, key), (flat,), (way,))

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -26,6 +27,7 @@ from jaxatt.faults import Fault
 from jaxatt.mounting import GimbalAxes, cmg_axes
 from jaxatt.study import batch, rerun, sweep, varied
 from jaxatt.systems import cmg_loss, gyro_ekf, observer_pd, star_isolation, wheel_mrac
+from jaxatt.tuning import tune
 from jaxatt.vec import Mat3, Quat, Vec3
 
 EXAMPLES = int(os.environ.get("JAXATT_FUZZ", "50"))
@@ -264,6 +266,14 @@ VERBS = {
         lambda system, params, scenario, key, ticks: simulate(vmapped(system), params, scenario, key, ticks=ticks),
         dict(system=st.just(LOOP), params=params, scenario=scenarios, key=keys, ticks=ticks),
         {"noise_or_key", "noise"},
+    ),
+    "tune": (
+        lambda cost, theta, optimizer, steps, key: tune(cost, theta, optimizer, steps, key, progress=False),
+        dict(cost=st.sampled_from([lambda theta, key: sum(jnp.sum(a**2) for a in jax.tree.leaves(theta)), None]),
+             theta=st.one_of(good(-2, 2), plain(), arrays([(2,)]).map(lambda a: {"a": a}), st.just({"a": (1, 2.0)})),
+             optimizer=st.sampled_from([optax.sgd(0.1), optax.sgd(0.1), optax.sgd(0.1), None, 3]),
+             steps=st.one_of(st.just(2), st.sampled_from([0, -1, 2.5, "a", None])), key=keys),
+        set(),
     ),
     "batch": (batch, dict(tree=st.one_of(scenarios, params), n=whole), set()),
 }  # fmt: skip
