@@ -195,7 +195,10 @@ def metadata_lock(handle: int):
 
 
 def take(handle: int, path: Path, mine: range) -> None:
-    """Lock my blocks until ``handle``, of the lock file, is closed. Raises RuntimeError if another process has some."""
+    """Lock the blocks mine until handle, the open lock file, is closed.
+
+    Raises RuntimeError if another process has some of them.
+    """
     try:
         fcntl.lockf(handle, fcntl.LOCK_EX | fcntl.LOCK_NB, len(mine), 1 + mine.start)
     except OSError:
