@@ -316,5 +316,5 @@ def tuned_figure(report, runs: dict, n: int) -> None:
         ax.set_xticks(range(len(runs)), [name.replace(", ", ",\n") for name in runs], fontsize=8)
         ax.set_title(f"{structure} {list(BASES[structure])} deg, {n} held-out momenta", fontsize=10)
     axes[0].set_ylabel("share of runs")
-    axes[1].legend(loc="lower left")
+    fig.legend(*axes[1].get_legend_handles_labels(), loc="outside upper center", ncols=3)
     report.figure("classes_before_after", fig)

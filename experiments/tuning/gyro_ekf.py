@@ -499,7 +499,7 @@ def noise_levels(report) -> None:
     report.check("Q and R tuned / true, decades", np.zeros(5), (best / np.log(10))[known] - np.log10(TRUE[known]), 0.1,
                  "levels the readings were made with")  # fmt: skip
 
-    batches = [recorded(VERDICT + i, n) for i in range(2 if report.quick else 16)]
+    batches = [recorded(VERDICT + i, n) for i in range(8 if report.quick else 16)]
     truth = jnp.where(known, TRUE, 1e-30)
     before, after, oracle = (
         jax.tree.map(lambda *a: np.concatenate(a), *(honesty(aboard, log) for log in batches))
