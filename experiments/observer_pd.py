@@ -95,7 +95,7 @@ def gains(theta):
 def smooth_loss(theta, scenario):
     """A smooth loss of one run of 15 s."""
     log = simulate(op.system, gains(theta), scenario, KEY, ticks=150)
-    return jnp.mean(objectives.alarm(log.xi, 0.01, 0.001) + 20 * norm(log.e_q)) + 0.02 * jnp.sqrt(
+    return jnp.mean(objectives.soft_alarm(log.xi, 0.01, 0.001) + 20 * norm(log.e_q)) + 0.02 * jnp.sqrt(
         jnp.mean(log.u @ log.u)
     )
 

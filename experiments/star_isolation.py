@@ -17,7 +17,7 @@ import numpy as np
 import optax
 
 from experiments.report import Report, interval, plt
-from jaxatt import Fault, Quat, Vec3, detection, plot, scores, simulate, sweep, tune
+from jaxatt import Fault, Quat, Vec3, detection, objectives, plot, scores, simulate, sweep, tune
 from jaxatt.lmmse import lmmse_predict, lmmse_start, lmmse_update
 from jaxatt.replay import replay
 from jaxatt.study import batch
@@ -726,9 +726,9 @@ def tuning(report: Report) -> None:
     def cost(theta, _):
         window, margin = jnp.exp(theta["window"]), jnp.exp(theta["margin"])
         threshold = 3 * window + margin * jnp.sqrt(6 * window)
-        J = detection.soft_windowed(train, window, longest)
-        p = detection.soft_alarm(J, threshold, 0.03 * threshold)
-        return jnp.mean(detection.soft_delay(p[onset:], DT)) + weight * jnp.mean(p[longest:onset])
+        J = objectives.soft_windowed(train, window, longest)
+        p = objectives.soft_alarm(J, threshold, 0.03 * threshold)
+        return jnp.mean(objectives.soft_delay(p[onset:], DT)) + weight * jnp.mean(p[longest:onset])
 
     start = {"window": np.log(10.0), "margin": np.log(5.0)}  # the rule "moment 5, N = 10"
     best, history = tune(cost, start, optax.adam(0.03), 80, jax.random.key(0))

@@ -190,31 +190,6 @@ def confusion(truth, verdict, causes: int = len(CAUSES)):
     return table
 
 
-# smooth surrogates, for gradients in thresholds, windows and gains
-
-
-@door
-def soft_windowed(evaluation, n, longest: int):
-    """`windowed` evaluation, (T, *lanes), by a window of real length n in [1, longest]: the oldest counts in part."""
-    a = jnp.asarray(evaluation)
-    weights = jnp.clip(n - jnp.arange(longest), 0, 1)
-    padded = jnp.concatenate([jnp.zeros((longest - 1, *a.shape[1:]), a.dtype), a])
-    return sum(weights[i] * padded[longest - 1 - i : longest - 1 - i + len(a)] for i in range(longest))
-
-
-@door
-def soft_alarm(evaluation, threshold, temperature):
-    """A probability of alarm in place of a step of the evaluation at the threshold, its limit for temperature -> 0."""
-    return jax.nn.sigmoid((evaluation - threshold) / temperature)
-
-
-@door
-def soft_delay(probability, dt):
-    """Expected time [s] to the first alarm, sum_k prod_{j<k} (1 - p_j) dt; at most T dt. probability p: (T, *lanes)."""
-    silent = jnp.cumprod(1 - probability, axis=0)
-    return dt * (1 + jnp.sum(silent[:-1], axis=0))
-
-
 # chi-square of the innovation, channel by channel
 
 

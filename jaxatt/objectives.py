@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxatt import scores
+from jaxatt.check import door
 from jaxatt.vec import safe_sqrt
 
 
@@ -36,6 +37,28 @@ def penalty(excess):
 # alarms
 
 
+@door
+def soft_windowed(evaluation, n, longest: int):
+    """`detection.windowed` evaluation, (T, *lanes), by a window of real length n in [1, longest]: the oldest counts in part."""
+    a = jnp.asarray(evaluation)
+    weights = jnp.clip(n - jnp.arange(longest), 0, 1)
+    padded = jnp.concatenate([jnp.zeros((longest - 1, *a.shape[1:]), a.dtype), a])
+    return sum(weights[i] * padded[longest - 1 - i : longest - 1 - i + len(a)] for i in range(longest))
+
+
+@door
+def soft_alarm(evaluation, threshold, temperature):
+    """A probability of alarm in place of a step of the evaluation at the threshold, its limit for temperature -> 0."""
+    return jax.nn.sigmoid((evaluation - threshold) / temperature)
+
+
+@door
+def soft_delay(probability, dt):
+    """Expected time [s] to the first alarm, sum_k prod_{j<k} (1 - p_j) dt; at most T dt. probability p: (T, *lanes)."""
+    silent = jnp.cumprod(1 - probability, axis=0)
+    return dt * (1 + jnp.sum(silent[:-1], axis=0))
+
+
 class Delay(NamedTuple):
     """Expected waiting time [s] for the first alarm in a window; its whole length if none is likely."""
 
@@ -57,16 +80,11 @@ class Detection(NamedTuple):
     false_alarms: Any  # [1] share of alarms before the onset
 
 
-def alarm(evaluation, threshold, temperature):
-    """Probability of alarm in place of the step at the threshold; all three in the unit of the evaluation."""
-    return jax.nn.sigmoid((evaluation - threshold) / temperature)
-
-
 def detection(now, probability, onset, start=0.0) -> Detection:
-    """Tally delay, miss and false alarms of the probability of `alarm` around a fault's onset [s].
+    """Tally delay, miss and false alarms of the probability of `soft_alarm` around a fault's onset [s].
 
     start: when false alarms begin to count [s]. The delay is 0 for an alarm at the first tick of the fault; it is one
-    tick less than `detection.soft_delay`, and can be had without keeping the run.
+    tick less than `soft_delay`, and can be had without keeping the run.
     """
     ill, quiet = now.t >= onset, (now.t < onset) & (now.t >= start)
     silent = jnp.where(ill, 1 - probability, 1)

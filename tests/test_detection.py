@@ -9,7 +9,7 @@ import numpy as np  # noqa: E402
 import pytest  # noqa: E402
 from scipy import stats  # noqa: E402
 
-from jaxatt import detection  # noqa: E402
+from jaxatt import detection, objectives  # noqa: E402
 
 RNG = np.random.default_rng(0)
 
@@ -18,9 +18,9 @@ def test_a_window_sums_the_last_values():
     J = RNG.chisquare(3, (50, 2, 4))
     plain = np.array([J[max(0, k - 6) : k + 1].sum(axis=0) for k in range(50)])
     np.testing.assert_allclose(detection.windowed(J, 7), plain, rtol=1e-14)
-    np.testing.assert_allclose(detection.soft_windowed(J, 7.0, 12), plain, rtol=1e-13)
+    np.testing.assert_allclose(objectives.soft_windowed(J, 7.0, 12), plain, rtol=1e-13)
     between = 0.5 * (detection.windowed(J, 7) + detection.windowed(J, 8))
-    np.testing.assert_allclose(detection.soft_windowed(J, 7.5, 12), between, rtol=1e-13)
+    np.testing.assert_allclose(objectives.soft_windowed(J, 7.5, 12), between, rtol=1e-13)
 
 
 @pytest.mark.parametrize("n", [0, -1, 1.5])
@@ -101,19 +101,19 @@ def test_chance_is_one_less_silence():
 def test_soft_delay_is_the_delay_where_alarms_are_certain():
     p = np.zeros((20, 3))
     p[[0, 7], [0, 1]] = 1.0
-    np.testing.assert_allclose(detection.soft_delay(jnp.asarray(p), 0.1), [0.1, 0.8, 2.0], rtol=1e-12)
+    np.testing.assert_allclose(objectives.soft_delay(jnp.asarray(p), 0.1), [0.1, 0.8, 2.0], rtol=1e-12)
 
 
 def test_surrogates_have_the_gradient_of_central_differences():
     J = jnp.asarray(RNG.chisquare(3, (40, 5)) * np.linspace(1, 6, 40)[:, None])
 
     def cost(theta):
-        p = detection.soft_alarm(detection.soft_windowed(J, theta[0], 8), theta[1], 2.0)
-        return jnp.mean(detection.soft_delay(p, 0.1)) + 30 * jnp.mean(p[:10])
+        p = objectives.soft_alarm(objectives.soft_windowed(J, theta[0], 8), theta[1], 2.0)
+        return jnp.mean(objectives.soft_delay(p, 0.1)) + 30 * jnp.mean(p[:10])
 
     at = jnp.array([3.4, 25.0])
     for i in range(2):
         h = 1e-5 * jnp.eye(2)[i]
         assert jax.grad(cost)(at)[i] == pytest.approx(float(cost(at + h) - cost(at - h)) / 2e-5, rel=1e-6)
-    certain = jax.grad(lambda p: jnp.sum(detection.soft_delay(p, 0.1)))(jnp.ones((4, 2)))
+    certain = jax.grad(lambda p: jnp.sum(objectives.soft_delay(p, 0.1)))(jnp.ones((4, 2)))
     assert np.isfinite(certain).all()

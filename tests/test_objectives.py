@@ -9,7 +9,6 @@ import pytest
 
 from jaxatt import Fault, linear, on_axes, scores, sweep
 from jaxatt import objectives as ob
-from jaxatt.detection import soft_delay
 from jaxatt.engine import Now
 from jaxatt.systems import observer_pd as op
 
@@ -42,26 +41,26 @@ def test_soft_detection_tends_to_the_real_one():
     evaluation = np.abs(RNG.normal(size=(60, 8))) + 1.5 * (np.arange(60) > 40)[:, None]
     onset, start = 3.05, 0.45
     for temperature, tolerance in ((0.2, 1.0), (1e-6, 1e-9)):
-        soft = told(lambda now, x, t=temperature: ob.detection(now, ob.alarm(x, 2.0, t), onset, start), evaluation)
+        soft = told(lambda now, x, t=temperature: ob.detection(now, ob.soft_alarm(x, 2.0, t), onset, start), evaluation)
         alarms, t = evaluation > 2.0, DT * np.arange(60)
         ill, quiet = t >= onset, (t < onset) & (t >= start)
         first = np.where(alarms[ill].any(0), DT * alarms[ill].argmax(0), DT * ill.sum())
         assert np.abs(soft.delay - first).max() <= tolerance
         assert np.abs(soft.miss - (~alarms[ill]).mean(0)).max() <= tolerance / 5
         assert np.abs(soft.false_alarms - alarms[quiet].mean(0)).max() <= tolerance / 5
-    p = ob.alarm(evaluation[31:], 2.0, 0.2)
+    p = ob.soft_alarm(evaluation[31:], 2.0, 0.2)
     delay = told(lambda now, x: ob.detection(now, x, 0.0), p).delay
-    np.testing.assert_allclose(delay, soft_delay(jnp.concatenate([p, p[:1]]), DT) - DT, rtol=1e-12)
+    np.testing.assert_allclose(delay, ob.soft_delay(jnp.concatenate([p, p[:1]]), DT) - DT, rtol=1e-12)
 
 
 def test_soft_settling_tends_to_the_last_time_outside():
     q = np.abs(np.exp(-0.3 * DT * np.arange(80))[:, None] * np.cos(DT * np.arange(80)[:, None] * np.linspace(1, 3, 6)))
     window = DT * np.arange(80) < 6.95
-    told_by = lambda width: told(lambda now, x: ob.settling(now, ob.alarm(x, 0.2, width), now.t < 6.95), q)
+    told_by = lambda width: told(lambda now, x: ob.settling(now, ob.soft_alarm(x, 0.2, width), now.t < 6.95), q)
     last = np.array([DT * (1 + np.flatnonzero(window & (column > 0.2)).max()) for column in q.T])
     np.testing.assert_allclose(told_by(1e-7), last, atol=1e-6)
     assert np.abs(told_by(0.01) - last).max() < 0.7  # a lobe that just reaches the band counts in part
-    p = ob.alarm(q[:70], 0.2, 0.05)
+    p = ob.soft_alarm(q[:70], 0.2, 0.05)
     silent_after = np.cumprod((1 - p)[::-1], axis=0)[::-1]
     np.testing.assert_allclose(told_by(0.05), DT * np.sum(1 - silent_after, axis=0), rtol=1e-12)
 
@@ -77,7 +76,7 @@ def test_chatter_is_the_rms_of_the_jumps_in_one_window():
 
 def test_tallies_go_through_a_sweep():
     def score(params, scenario, now, log):
-        p = ob.alarm(log.xi, params.sigma, 0.1 * params.sigma)
+        p = ob.soft_alarm(log.xi, params.sigma, 0.1 * params.sigma)
         return ob.detection(now, p, scenario.gyro.x.onset), ob.chatter(log.u.x)
 
     scenario = op.scenario._replace(gyro=on_axes(Fault(2.0, bias=0.05)), star=on_axes(Fault()))

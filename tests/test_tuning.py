@@ -15,7 +15,7 @@ import pytest
 
 from jaxatt import Fault, System, Vec3, on_axes, scores, simulate, sweep
 from jaxatt.controllers import Steering
-from jaxatt.objectives import alarm
+from jaxatt.objectives import soft_alarm
 from jaxatt.systems import cmg_loss as cmg
 from jaxatt.systems import gyro_ekf as ge
 from jaxatt.systems import observer_pd as op
@@ -275,7 +275,11 @@ def observer_pd(theta, key):
         q_hat=Vec3(0.35, 0.2, -0.6), gyro=on_axes(Fault(1.0, drift=0.1 * jnp.exp(theta["size"])))
     )
     log = simulate(op.system, p, scenario, key, ticks=40)
-    return jnp.mean(log.e_q @ log.e_q) + 1e-6 * jnp.mean(log.u @ log.u) + 1e-2 * jnp.mean(alarm(log.xi, p.sigma, 0.01))
+    return (
+        jnp.mean(log.e_q @ log.e_q)
+        + 1e-6 * jnp.mean(log.u @ log.u)
+        + 1e-2 * jnp.mean(soft_alarm(log.xi, p.sigma, 0.01))
+    )
 
 
 def gyro_ekf_pid(theta, key):

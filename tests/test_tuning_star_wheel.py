@@ -7,7 +7,7 @@ import pytest
 
 from experiments.tuning import star_isolation as stars
 from experiments.tuning import wheel_mrac as wheel
-from jaxatt import detection, noise_of, simulate
+from jaxatt import detection, noise_of, objectives, simulate
 from jaxatt.controllers import Adaptation, mrac_sampled_bound
 from jaxatt.systems import star_isolation as si
 from jaxatt.systems import wheel_mrac as wm
@@ -42,7 +42,7 @@ def surrogate(flown):
             J, threshold = stars.evaluated(numbers, flown[1]), stars.threshold_of(*numbers[:2])
             soft, hard = (
                 stars.terms_of(p, flown[1].faulty)
-                for p in (detection.soft_alarm(J, threshold, temperature), 1.0 * (threshold < J))
+                for p in (objectives.soft_alarm(J, threshold, temperature), 1.0 * (threshold < J))
             )
             return jnp.mean(stars.cost_of(*soft)), hard
 

@@ -22,7 +22,7 @@ import optax
 from experiments.report import interval, plt
 from experiments.star_isolation import drawn
 from experiments.tuning import compare
-from jaxatt import Fault, Vec3, detection, scores, simulate, sweep, tune
+from jaxatt import Fault, Vec3, detection, objectives, scores, simulate, sweep, tune
 from jaxatt.engine import compiled
 from jaxatt.study import batch
 from jaxatt.systems import star_isolation as si
@@ -124,7 +124,7 @@ def residuals(params, data: Recorded):
 def evaluated(numbers, data: Recorded):
     """J of both filters with a window of real length, shape (END - 1, 2, n)."""
     window, _, std_gyro = numbers
-    return detection.soft_windowed(residuals(si.params._replace(std_gyro=std_gyro), data), window, LONGEST)
+    return objectives.soft_windowed(residuals(si.params._replace(std_gyro=std_gyro), data), window, LONGEST)
 
 
 def terms_of(p, faulty):
@@ -132,7 +132,7 @@ def terms_of(p, faulty):
     first = faulty == ROLL
     own, other = jnp.where(first, p[:, ROLL], p[:, PITCH]), jnp.where(first, p[:, PITCH], p[:, ROLL])
     quiet = jnp.concatenate([own[SETTLED : ONSET - 1], other[SETTLED:]])  # what should be silent
-    return detection.soft_delay(own[ONSET - 1 :], DT), jnp.mean(quiet, axis=0)
+    return objectives.soft_delay(own[ONSET - 1 :], DT), jnp.mean(quiet, axis=0)
 
 
 def cost_of(delay, false):
@@ -143,7 +143,7 @@ def cost_of(delay, false):
 def each_cost(numbers, data: Recorded, temperature=TEMPERATURE, hard: bool = False):
     """Cost [s] of every run, shape (n,); hard: by steps, with no gradient."""
     J, threshold = evaluated(numbers, data), threshold_of(*numbers[:2])
-    p = 1.0 * (threshold < J) if hard else detection.soft_alarm(J, threshold, temperature)
+    p = 1.0 * (threshold < J) if hard else objectives.soft_alarm(J, threshold, temperature)
     return cost_of(*terms_of(p, data.faulty))
 
 
