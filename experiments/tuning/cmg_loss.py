@@ -230,7 +230,7 @@ BEFORE = {
 def tuned(report) -> None:
     """Tune, choose, judge."""
     n = 16
-    steps = 6 if report.quick else 25
+    steps = 6 if report.quick else 14
     here = momenta(TUNE, n)
 
     def mean_cost(theta, h):
@@ -277,7 +277,7 @@ def tuned(report) -> None:
     tuned_figure(report, runs, n)
 
 
-OPTIMIZER = optax.adam(0.15, b2=0.95)
+OPTIMIZER = optax.adam(0.5, b2=0.9)
 
 
 def verdict_score(params, scenario, now, log):
