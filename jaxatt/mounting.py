@@ -113,6 +113,14 @@ def check_gimbal_axes(name: str, axes: GimbalAxes, used: Any = True) -> None:
     """
     if not check.concrete((axes, used)):
         return
+    check.kind(name, axes, GimbalAxes)
+    for field, v in zip(GimbalAxes._fields, axes):
+        check.kind(f"{name}.{field}", v, Vec3)
+    shapes = [np.shape(c) for v in check.numbers(name, axes) for c in v] + [np.shape(used)]
+    try:
+        np.broadcast_shapes(*shapes)
+    except ValueError:
+        check.refuse(name, "have components of one shape, that of `used` too", " and ".join(map(str, set(shapes))))
     r, s0 = (np.stack(np.broadcast_arrays(*(np.asarray(c, float) for c in v))) for v in axes)
     if r.ndim < 2:
         check.refuse(f"{name}.r", "have shape (n, *lanes) with the modules first", f"of shape {r.shape[1:]}")
