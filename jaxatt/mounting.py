@@ -98,6 +98,14 @@ def cmg_triads(axes: GimbalAxes, gamma) -> Triads:
     return Triads(axes.r, cos * axes.s0 + sin * t0, cos * t0 - sin * axes.s0)
 
 
+def _fit(shapes) -> bool:
+    try:
+        np.broadcast_shapes(*shapes)
+    except ValueError:
+        return False
+    return True
+
+
 @door
 def modules(axes: GimbalAxes, which) -> GimbalAxes:
     """The cluster of the modules ``which`` alone, a list of indices."""
@@ -117,9 +125,7 @@ def check_gimbal_axes(name: str, axes: GimbalAxes, used: Any = True) -> None:
     for field, v in zip(GimbalAxes._fields, axes):
         check.kind(f"{name}.{field}", v, Vec3)
     shapes = [np.shape(c) for v in check.numbers(name, axes) for c in v] + [np.shape(used)]
-    try:
-        np.broadcast_shapes(*shapes)
-    except ValueError:
+    if not _fit(shapes):
         check.refuse(name, "have components of one shape, that of `used` too", " and ".join(map(str, set(shapes))))
     r, s0 = (np.stack(np.broadcast_arrays(*(np.asarray(c, float) for c in v))) for v in axes)
     if r.ndim < 2:

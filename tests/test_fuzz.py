@@ -52,7 +52,7 @@ def judged(f, names, *args, **kwargs):
     except (ValueError, TypeError) as error:
         said = str(error)
         assert "\n" not in said and len(said) < 1000, said
-        named = {re.split(r"\W", word.lstrip("|"))[0] for word in re.findall(r"`([^`]+)`", said)}
+        named = {word for words in re.findall(r"`([^`]+)`", said) for word in re.findall(r"\w+", words)}
         assert named & set(names), (said, names)
         assert traceback.extract_tb(error.__traceback__)[-1].filename.startswith(HOME), said
         assert error.__suppress_context__ or error.__context__ is None, said
