@@ -101,8 +101,12 @@ def read(c: Channel, truth):
 
 
 def check_fault(name: str, fault: Fault) -> None:
-    """Refuse, with ValueError, a fault with NaN, a negative size of noise, tau <= 0 or end < onset."""
-    check.a_number(name, fault)
+    """Refuse, with ValueError, a fault with NaN, a negative size of noise, tau <= 0 or end < onset.
+
+    TypeError for what is no `Fault` of numbers.
+    """
+    check.kind(name, fault, Fault)
+    check.a_number(name, check.numbers(name, fault))
     check.positive(f"{name}.tau", fault.tau)
     for field in ("random", "growth"):
         check.not_negative(f"{name}.{field}", getattr(fault, field))

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxatt import scores
+from jaxatt import check, scores
 from jaxatt.check import door
 from jaxatt.vec import safe_sqrt
 
@@ -28,6 +28,7 @@ def weighted(terms, weights: dict):
     return sum(weight * jnp.mean(terms[name]) for name, weight in weights.items())
 
 
+@door
 def penalty(excess):
     """Price of a constraint excess <= 0 that is violated: its square, 0 where it holds. Smooth to first order."""
     over = jnp.maximum(excess, 0)
@@ -39,8 +40,12 @@ def penalty(excess):
 
 @door
 def soft_windowed(evaluation, n, longest: int):
-    """`detection.windowed` evaluation, (T, *lanes), by a window of real length n in [1, longest]: the oldest counts in part."""
+    """`detection.windowed` evaluation, (T, *lanes), by a window of real length n in [1, longest].
+
+    The oldest value counts in part. Raises ValueError for longest < 1.
+    """
     a = jnp.asarray(evaluation)
+    longest = min(check.whole("longest", longest), len(a))  # a window holds no more than the run
     weights = jnp.clip(n - jnp.arange(longest), 0, 1)
     padded = jnp.concatenate([jnp.zeros((longest - 1, *a.shape[1:]), a.dtype), a])
     return sum(weights[i] * padded[longest - 1 - i : longest - 1 - i + len(a)] for i in range(longest))
@@ -80,6 +85,7 @@ class Detection(NamedTuple):
     false_alarms: Any  # [1] share of alarms before the onset
 
 
+@door
 def detection(now, probability, onset, start=0.0) -> Detection:
     """Tally delay, miss and false alarms of the probability of `soft_alarm` around a fault's onset [s].
 
@@ -116,6 +122,7 @@ class SoftSettling(NamedTuple):
         return self.time
 
 
+@door
 def settling(now, outside, inside: Any = True) -> SoftSettling:
     """Tally a smooth settling time [s]; outside: probability of being outside the band, `alarm` of the error.
 
@@ -151,6 +158,7 @@ class Chatter(NamedTuple):
         return jnp.where(some, safe_sqrt(self.total / jnp.where(some, self.ticks - 1, 1)), jnp.nan)
 
 
+@door
 def chatter(value, inside: Any = True) -> Chatter:
     """Tally how much ``value``, a command, jumps from tick to tick in one window: the wear of an actuator."""
     value = jnp.asarray(value, jnp.result_type(value, 1.0))
@@ -162,6 +170,7 @@ def chatter(value, inside: Any = True) -> Chatter:
 # estimators
 
 
+@door
 def innovation_cost(innovation, variance, valid: Any = True):
     """Negative log likelihood of a scalar innovation that a filter believes to be N(0, variance); 0 where not valid.
 
@@ -176,6 +185,7 @@ def innovation_cost(innovation, variance, valid: Any = True):
 # stability
 
 
+@door
 def growth_rate(matrix, period, sharpness):
     """Smooth largest growth rate [1/s] of a sampled loop: log-sum-exp of those of `linear.growth_rates`.
 

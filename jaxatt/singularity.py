@@ -229,7 +229,12 @@ def singular_momentum(axes: GimbalAxes, u: Vec3, signs):
 
 @door
 def sign_patterns(n: int) -> np.ndarray:
-    """The 2^(n-1) patterns of signs, shape (patterns, n), first sign +: the others are these with u and e reversed."""
+    """The 2^(n-1) patterns of signs, shape (patterns, n), first sign +: the others are these with u and e reversed.
+
+    Raises ValueError for n < 1 and n > 20, a million patterns.
+    """
+    if check.whole("n", n) > 20:
+        check.refuse("n", "not exceed 20 modules", n)
     return np.array([(1, *rest) for rest in product((1, -1), repeat=n - 1)])
 
 
@@ -289,7 +294,11 @@ def _distance(axes: GimbalAxes, u: Vec3, signs, h: Vec3):
 
 @door
 def sphere(m: int) -> Vec3:
-    """m nearly even unit vectors (Fibonacci's spiral), shape (m,)."""
+    """m nearly even unit vectors (Fibonacci's spiral), shape (m,).
+
+    Raises ValueError for m < 1, and where the free memory does not hold them.
+    """
+    check.fits_memory(f"`m` = {check.whole('m', m)}", 64 * m, "ask for fewer")
     z = 1 - (2 * np.arange(m) + 1) / m
     turn = np.pi * (1 + 5**0.5) * np.arange(m)
     rho = np.sqrt(1 - z * z)

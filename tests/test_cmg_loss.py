@@ -277,7 +277,9 @@ def test_what_is_wrong_is_flagged_and_leaves_the_others_alone(paper, cases):
 
 def test_six_modules_with_three_lost():
     axes = cmg_axes(np.radians(60.0), np.arange(6) * np.pi / 3)
-    failure = cmg.Failure(*(np.where(np.arange(6) < 3, a, b) for a, b in ((0.0, np.inf), (1e-6, 0), (0, 0), (0, 0))))
+    failure = cmg.Failure(
+        *(np.where(np.arange(6) < 3, a, b) for a, b in ((0.0, np.inf), (1e-6, 0.0), (0.0, 0.0), (0.0, 0.0)))
+    )
     gamma = np.radians([30.0, 50, 70, 20, 10, -40])
     six = cmg.Scenario(gamma, failure, axes, rate=np.zeros(6), spin=np.full(6, 600.0))
     cmg.refuse_bad(cmg.params, six)

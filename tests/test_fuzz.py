@@ -21,7 +21,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import jaxatt
-from jaxatt import attitude, check, detection, faults, linear, mounting, scores, singularity, vec
+from jaxatt import attitude, check, detection, faults, linear, mounting, objectives, scores, singularity, vec
 from jaxatt.engine import Now, System, admit, noise_of, simulate, vmapped
 from jaxatt.faults import Fault
 from jaxatt.mounting import GimbalAxes, cmg_axes
@@ -148,6 +148,7 @@ PARTS = [
     *public(mounting),
     *public(faults),
     *public(detection),
+    *public(objectives, "weighted"),
     *public(scores, "is_tally", "empty", "add", "values"),
     *public(singularity),
     linear.growth_rates,

@@ -206,7 +206,7 @@ def test_growth_rates_of_a_known_loop():
     M = sampled(loop, 1.0, 1.0, ticks=5)
     np.testing.assert_allclose(growth_rates(M, 0.05), [-0.1, -0.1], atol=1e-9)
     assert sampled(loop, 1.0, 1.0, ticks=1, states=("pos",)).shape == (1, 1)
-    with pytest.raises(ValueError, match="`states` must be of"):
+    with pytest.raises(ValueError, match="`states` must be a tuple of"):
         sampled(loop, 1.0, 1.0, ticks=1, states=("spin",))
 
 
