@@ -40,7 +40,7 @@ def lanes(n=40, size=1.0):
 # groups
 
 
-finite = dict(allow_nan=False, allow_infinity=False)
+finite = dict(allow_nan=False, allow_infinity=False, allow_subnormal=False)  # XLA may flush subnormals to zero
 coordinate = st.one_of(st.floats(-3, 3, **finite), st.sampled_from([0.0, 1.0, -1.0, 1e-9, 1e3, -1e-3]))
 mrps = st.builds(Vec3, coordinate, coordinate, coordinate).map(lambda q: Vec3(*map(np.float64, q)))
 units = mrps.map(at.quat_from_mrp)
