@@ -202,7 +202,7 @@ def cma_es(costs: Callable, start, low, high, budget: int, seed: int, spread: fl
     It starts anew from ``start``, larger by its own rule, where it has converged before the budget is spent.
     """
     try:
-        import cma
+        import cma  # pyright: ignore[reportMissingImports]
     except ImportError as missing:
         raise ImportError("`cma_es` needs the library cma: pip install 'jaxatt[bench]'") from missing
     start, low, high = (np.asarray(a, float) for a in (start, low, high))

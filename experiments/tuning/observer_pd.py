@@ -414,7 +414,17 @@ def worst(report, balanced: dict) -> None:
 
         low = jax.tree.map(np.negative, box)
         rate = optax.cosine_decay_schedule(0.2, steps, 0.02)
-        fault, history = worst_case(harm, low, box, optax.adam(rate), steps, TUNING, starts=6)
+        _, history = worst_case(harm, low, box, optax.adam(rate), steps, TUNING, starts=6)
+        met = jax.tree.map(lambda a: a.reshape(-1, a.shape[-1]), history.theta)
+
+        def peak_and_error(fault, params=params):
+            log = simulate(op.system, params, growing(**fault), quiet, ticks=250)
+            return jnp.max(log.xi) / params.sigma, jnp.mean(norm(log.e_q)[-20:])
+
+        # A penalty is exceeded a little at its optimum: of all faults met, take the worst that is silent indeed.
+        peaks, errors = jax.jit(jax.vmap(peak_and_error))(met)
+        most = int(np.argmax(np.where(np.asarray(peaks) <= 1, errors, -np.inf)))
+        fault = {name: a[most] for name, a in met.items()}
         log = simulate(op.system, params, growing(**fault), quiet, ticks=250)
         silent[label] = degrees(float(jnp.mean(norm(log.e_q)[-20:])))
         ends = np.sort(history.cost.max(0))
