@@ -166,7 +166,8 @@ def surfaces(report: Report) -> None:
         ax = fig.add_subplot(1, 2, i + 1, projection="3d")
         ax.scatter(*shown, s=1, linewidths=0, c=shown[2], cmap="viridis", rasterized=True)
         ax.set(xlabel="$\\gamma_1$ [deg]", ylabel="$\\gamma_2$ [deg]", zlabel="$\\gamma_3$ [deg]")
-        ax.set_box_aspect(None, zoom=0.88)  # room for the label of the vertical axis
+        # Room for the label of the vertical axis. The stubs know whole zooms only.
+        ax.set_box_aspect(None, zoom=0.88)  # pyright: ignore[reportArgumentType]
         ax.set_title(f"{name}: condition $\\geq$ 100, {shown.shape[1]} of 120$^3$")
     fig.tight_layout(w_pad=4)
     report.figure("figure_5_singular_angles", fig)
