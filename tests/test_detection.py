@@ -117,3 +117,10 @@ def test_surrogates_have_the_gradient_of_central_differences():
         assert jax.grad(cost)(at)[i] == pytest.approx(float(cost(at + h) - cost(at - h)) / 2e-5, rel=1e-6)
     certain = jax.grad(lambda p: jnp.sum(objectives.soft_delay(p, 0.1)))(jnp.ones((4, 2)))
     assert np.isfinite(certain).all()
+
+
+@pytest.mark.parametrize(
+    ("k", "n", "low", "high"), [(0, 10, 0.0, 0.27753), (5, 10, 0.23659, 0.76341), (10, 10, 0.72247, 1.0)]
+)
+def test_wilson_interval(k, n, low, high):
+    assert detection.interval(k, n) == pytest.approx((low, high), abs=1e-5)

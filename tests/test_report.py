@@ -2,9 +2,8 @@ import json
 
 import matplotlib.pyplot as plt
 import numpy as np
-import pytest
 
-from experiments.report import Report, interval
+from experiments.report import Report
 
 
 def test_checks_figures_and_metrics(tmp_path, capsys):
@@ -25,10 +24,3 @@ def test_checks_figures_and_metrics(tmp_path, capsys):
     assert metrics["figures"] == ["toy/line.png"] and (tmp_path / "toy" / "line.png").exists()
     assert "jax" in metrics["versions"]
     assert "NOT OK" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("k", "n", "low", "high"), [(0, 10, 0.0, 0.27753), (5, 10, 0.23659, 0.76341), (10, 10, 0.72247, 1.0)]
-)
-def test_wilson_interval(k, n, low, high):
-    assert interval(k, n) == pytest.approx((low, high), abs=1e-5)

@@ -285,3 +285,12 @@ def test_bad_input_is_refused_in_one_line():
         sg.singular_area(FOUR["box"])
     with pytest.raises(ValueError, match="three modules"):
         sg.rearrange_by_gradient(FOUR["box"], np.zeros(4))
+
+
+@pytest.mark.parametrize("m", [100, 1000])
+def test_points_on_the_sphere_are_even(m):
+    points = np.stack(sg.sphere(m), axis=-1)
+    np.testing.assert_allclose(np.linalg.norm(points, axis=1), 1, rtol=1e-12)
+    apart = np.linalg.norm(points[:, None] - points, axis=-1) + 9 * np.eye(m)
+    nearest = apart.min(1) * np.sqrt(m / (4 * np.pi))  # 1.07 in a hexagonal lattice
+    assert nearest.min() > 0.8 and nearest.max() < 1.08
