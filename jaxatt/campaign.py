@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxatt import check
-from jaxatt.engine import BLOCK, System, block_records, block_scores, compiled, one_key
+from jaxatt.engine import BLOCK, System, block_records, compiled, one_key
 from jaxatt.store import (
     OWN,
     Store,
@@ -44,7 +44,7 @@ from jaxatt.store import (
     take,
     write_block,
 )
-from jaxatt.study import _bar, _lanes_of, _unpacked, logged, scored
+from jaxatt.study import _bar, _lanes_of, _unpacked, logged, score_shapes, scored
 from jaxatt.summary import Rate, narrowed
 
 try:
@@ -184,14 +184,14 @@ def _variables(campaign: Campaign) -> dict[str, Variable]:
     params, scenarios = check.converted(campaign.params, scenarios)
     if _refused(campaign.system, params, scenarios).all():
         campaign.system.check(params, scenarios)
-    run = partial(block_scores, campaign.system, campaign.score, campaign.ticks)
-    operands = params, scenarios, campaign.key, np.int32(0)
+    scores = score_shapes(campaign.system, params, scenarios, campaign.key, campaign.ticks, campaign.score)
     found = [("status", "status", np.zeros(BLOCK, np.int8))]
-    found += [("score", *item) for item in _named(jax.eval_shape(run, *operands), "score").items()]
+    found += [("score", *item) for item in _named(scores, "score").items()]
     found += [("input", *item) for item in _named(inputs, "input").items()]
     if campaign.record is not None:
-        run = partial(block_records, campaign.system, campaign.record, campaign.ticks, campaign.every)
-        found += [("record", *item) for item in _named(jax.eval_shape(run, *operands), "record").items()]
+        static = campaign.system, campaign.record, campaign.ticks, campaign.every
+        records = compiled(block_records, 4).eval_shape(*static, params, scenarios, campaign.key, np.int32(0))
+        found += [("record", *item) for item in _named(records, "record").items()]
     variables = {}
     for role, name, a in found:
         if name in (*variables, OWN, "time", "scenario"):

@@ -65,6 +65,13 @@ def scored(system, params, scenarios, key, ticks, score, first: int = 0, advance
     return jax.tree.map(lambda *parts: np.concatenate(parts, axis=-1)[..., :n], *done)
 
 
+def score_shapes(system, params, scenarios, key, ticks, score):
+    """Shapes and types of a block's scores, of admitted input, from the trace that `scored` runs next."""
+    rows, layout = _packed(scenarios)
+    operands = params, key, _lanes_of(rows, 0), np.int32(0)
+    return compiled(_packed_scores, 4).eval_shape(system, score, ticks, layout, *operands)
+
+
 def _bar(progress: bool | None, total: int, unit: str, done: int = 0):
     """A progress bar of total units, some done before; progress None: on a terminal or in a notebook, after 2 s."""
     seen = sys.stderr.isatty() or "ipykernel" in sys.modules
