@@ -371,10 +371,12 @@ def by_jaxatt(start, ticks: int):
     n = start.shape[1]
     if n == 1:
         s = Scenario(vec3(q[:, 0]), vec3(w[:, 0]), h[:, 0], mat3(J))
-        log = lambda: simulate(WHEELED, FEEDBACK, s, key, ticks=ticks + 1, every=ticks)
-        return lambda: np.concatenate(
-            [a[-1:].T for a in map(np.asarray, (array(log().q).T, array(log().w).T, log().h))]
-        )
+
+        def one():
+            log = simulate(WHEELED, FEEDBACK, s, key, ticks=ticks + 1)  # with its log, as one runs a single scenario
+            return np.concatenate([np.stack(log.q)[:, -1:], np.stack(log.w)[:, -1:], log.h[-1:].T])
+
+        return one
     s = Scenario(vec3(q), vec3(w), h, jax.tree.map(lambda a: np.broadcast_to(a, (n,)), mat3(J)))
 
     def run():

@@ -116,6 +116,7 @@ def kalman_update(belief: Belief, y: Reading, h: Callable, R) -> tuple[Belief, E
     return Belief(mean, cov), Evidence(nis, rows, nll)
 
 
+@jax.jit  # which keeps its loops compiled from call to call
 def nees(belief: Belief, truth):
     """Normalised estimation error squared e' P^-1 e, shape (*lanes); chi-square with n degrees of freedom.
 

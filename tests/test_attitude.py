@@ -146,6 +146,7 @@ def test_euler_angles_agree_with_scipy_and_with_their_rate():
     close(rate, quat_rate(q, w))
 
 
+@pytest.mark.slow
 def test_gradients_are_finite_at_zero_rotation():
     zero = Vec3(0.0, 0.0, 0.0)
     for f in (

@@ -21,10 +21,10 @@ from jaxatt import bodies, simulate, sweep  # noqa: E402
 from jaxatt.attitude import quat_rate, quat_rotate  # noqa: E402
 from jaxatt.bodies import ModuleInertia, cluster_inertia, cluster_momentum  # noqa: E402
 from jaxatt.controllers import Steering, steer  # noqa: E402
-from jaxatt.engine import rk4  # noqa: E402
+from jaxatt.engine import Now, rk4  # noqa: E402
 from jaxatt.mounting import GimbalAxes, cmg_axes, cmg_triads, modules  # noqa: E402
 from jaxatt.systems import cmg_loss as cmg  # noqa: E402
-from jaxatt.vec import Quat, Vec3, mat3, once, vec3  # noqa: E402
+from jaxatt.vec import Quat, Vec3, array, mat3, once, vec3  # noqa: E402
 
 KEY = jax.random.key(0)
 P, B = cmg.PYRAMID, cmg.BOX
@@ -207,12 +207,14 @@ def cases(paper):
     return swept(cmg.params, paper), swept(cmg.table5, paper)
 
 
+@pytest.mark.slow
 def test_start(cases):
     for run in cases:
         np.testing.assert_allclose(run.start, [case[4] for case in CASES], atol=1e-10)
         assert run.ok.all() and run.absorbable.all() and (run.momentum < 1e-7).all()
 
 
+@pytest.mark.slow
 def test_classes_of_table_5(cases):
     printed, table5 = map(cmg.classify, cases)
     assert table5.tolist() == [case[2] for case in CASES]
@@ -221,6 +223,7 @@ def test_classes_of_table_5(cases):
     ]
 
 
+@pytest.mark.slow
 def test_settling_and_residual_rate(cases):
     printed, table5 = cases
     assert printed.settling[0] == pytest.approx(30.4, abs=0.1)
@@ -241,6 +244,7 @@ def test_condition_of_figure_7(params, peak, at):
 # faults, seams, batches
 
 
+@pytest.mark.slow
 def test_failures_of_table_1():
     start = (P, (45, 45, 45, 45))
     several = [
@@ -262,6 +266,7 @@ def test_failures_of_table_1():
         np.testing.assert_allclose(b[..., 1], a, rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_what_is_wrong_is_flagged_and_leaves_the_others_alone(paper, cases):
     calm = paper[0]
     broken = calm._replace(spin=np.array([600.0, 1e200, 600.0, 600.0]))  # overflows
@@ -273,6 +278,14 @@ def test_what_is_wrong_is_flagged_and_leaves_the_others_alone(paper, cases):
     assert cmg.classify(got)[0] == cmg.FLUCTUATION  # NaN is never proper
     for a, b in zip(jax.tree.leaves(cases[1]), jax.tree.leaves(got)):
         np.testing.assert_array_equal(a, b[..., 3:])
+
+
+def test_the_gyro_reads_rate_bias_and_noise():
+    s = cmg.lost(P, (45, 45, 45, 45))._replace(bias_w=Vec3(1e-3, -2e-3, 3e-3), std_w=1e-4)
+    x, z = cmg.init(cmg.params, s)
+    read = cmg.sense(cmg.params, s, Now(0, 0.0, cmg.DT), x, z, jnp.array([1.0, 2.0, -3.0]))
+    np.testing.assert_allclose(array(read.w - x.w), [1.1e-3, -1.8e-3, 2.7e-3], rtol=1e-10)
+    assert read.healthy.tolist() == [1, 1, 1, 0] and (read.gamma == x.gamma).all()
 
 
 def test_six_modules_with_three_lost():
@@ -322,6 +335,7 @@ def test_steering_laws():
         np.testing.assert_allclose(robust, T.T @ np.linalg.solve(T @ T.T + lam * E, np.array(a)), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_robust_inverse_ends_the_chatter(paper):
     """With lam0 = 0.01 and K_I = 0 none of the reference's hard cases fluctuates; dither frees the pyramid's lock."""
     robust, dithered = (
@@ -333,6 +347,7 @@ def test_robust_inverse_ends_the_chatter(paper):
     assert dithered[2] == cmg.PROPER and dithered[8] == cmg.LOCK
 
 
+@pytest.mark.slow
 def test_steering_has_finite_gradients_at_singularities():
     for gamma in ([90.0, 0, -90, 0], [-90, 90, 90, 95], [0, 0, 0, 0]):
         for skew in (P, B):

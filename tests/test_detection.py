@@ -104,6 +104,7 @@ def test_soft_delay_is_the_delay_where_alarms_are_certain():
     np.testing.assert_allclose(objectives.soft_delay(jnp.asarray(p), 0.1), [0.1, 0.8, 2.0], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_surrogates_have_the_gradient_of_central_differences():
     J = jnp.asarray(RNG.chisquare(3, (40, 5)) * np.linspace(1, 6, 40)[:, None])
 

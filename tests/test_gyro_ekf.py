@@ -155,6 +155,7 @@ def test_float32_stays_positive_with_precise_sensors():
     assert np.linalg.eigvalsh(np.asarray(b.cov, float)).min() > 0
 
 
+@pytest.mark.slow
 def test_filter_steps_differentiate(problem):
     f, h, _, _, belief, rng = problem
     y = jnp.asarray(rng.normal(size=4))
@@ -217,6 +218,7 @@ def test_observability_of_a_double_integrator():
 
 
 @pytest.mark.parametrize("told, expected", [(0.0, ZERO), (1.0, PINV)])
+@pytest.mark.slow
 def test_growth_rates_of_the_sixteen_subsets(told, expected):
     still = Scenario(w=Vec3(0.0, 0.0, 0.0), h=np.zeros(4), bias=np.zeros(4))
     scenarios = batch(still, 16)._replace(announced=np.full(16, told), gyro=failed(MASKS))
@@ -295,6 +297,7 @@ def test_printed_covariances_make_the_chi_square_mute(filtered):
 # the loop without the filter
 
 
+@pytest.mark.slow
 def test_bias_is_borne_by_the_integral_without_a_filter():
     """And a run at 90 deg of roll is flagged, the other goes on."""
     quiet = Scenario(**QUIET)
@@ -354,6 +357,7 @@ def test_smoothed_noise_is_chi_square():
     np.testing.assert_allclose([c.mean(), (c > 3.841).mean()], [1, 0.05], rtol=0.05)
 
 
+@pytest.mark.slow
 def test_loop_drops_the_faulty_gyro_by_itself():
     n = 8
     who = np.arange(n) % 4

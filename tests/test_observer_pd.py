@@ -80,6 +80,7 @@ def test_the_observer_from_zero():
     assert last_outside(log.xi, 0.01, 0.01) == pytest.approx(8.86, abs=0.02)
 
 
+@pytest.mark.slow
 def test_the_rate_gain_lands_on_its_floor_and_never_below():
     params = op.params._replace(eps=0.00304)
     floor = float(rate_gain_floor(Vec3(0.0, 0.0, 0.0), 0.00304, 31.8566039))
@@ -118,6 +119,7 @@ def windows(params, scenario, now, log):
         (0.00304, 0.06, [(0.001288, 0, 0.001184, 0.009374), (0.05292, 0.992, 0.001284, 0.01006), (0.07514, 1, 0.07812, 0.6194)]),
     ],
 )  # fmt: skip
+@pytest.mark.slow
 def test_the_monte_carlo_table(eps, tolerance, table):
     system = op.system._replace(substeps=4 if eps == 0.1 else 8)
     swept = sweep(
@@ -137,6 +139,7 @@ def test_constant_faults_hide():
     assert log.xi[2500:].min() < 0.01
 
 
+@pytest.mark.slow
 def test_gradients_are_finite_at_rest():
     zero = Vec3(0.0, 0.0, 0.0)
     scenario = QUIET._replace(q=zero, w=zero, q_hat=zero, w_hat=zero)

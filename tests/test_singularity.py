@@ -100,6 +100,7 @@ def test_rank_one_is_seen():
     assert kappa == 1 and not rank_one
 
 
+@pytest.mark.slow
 def test_condition_has_finite_gradients():
     kappa = lambda g: sg.condition(cmg_triads(THREE["pyramid"], g).t)
     g = angles(3, 1)[:, 0]
@@ -120,6 +121,7 @@ def test_table_3(points):
     assert got == [(count, points**3) for count in COUNTS[points]]
 
 
+@pytest.mark.slow
 def test_table_3_in_single_precision():
     printed = {72: (0.0246, 0.0609), 360: (0.0237, 0.0463), 720: (0.0236, 0.0438)}
     for points, fractions in printed.items():
@@ -220,15 +222,19 @@ def test_reach_along_the_axes(name):
     assert (np.asarray(sg.reach(THREE[name], d)) <= np.asarray(sg.support(THREE[name], d)) + 1e-9).all()
 
 
-def test_envelopes():
+@pytest.mark.slow
+def test_envelopes_of_the_pyramid():
     pyramid = [sg.envelope(axes["pyramid"], 400) for axes in (FOUR, THREE)]
     assert pyramid[0].inscribed / pyramid[1].inscribed == pytest.approx(1.607, abs=0.01)
+    assert pyramid[0].largest == pytest.approx(3.2667, abs=1e-4)
+    assert pyramid[1].largest == pytest.approx(2.8284, abs=1e-4)
+
+
+def test_envelope_of_the_box():
     box = sg.envelope(FOUR["box"], 400)
     assert box.inscribed == pytest.approx(2, abs=1e-6)
     assert box.volume == pytest.approx(24 ** (1 / 3), rel=2e-3)  # two crossed discs added: 32 pi
     assert box.largest == pytest.approx(4, abs=1e-6)
-    assert pyramid[0].largest == pytest.approx(3.2667, abs=1e-4)
-    assert pyramid[1].largest == pytest.approx(2.8284, abs=1e-4)
 
 
 def test_area_of_the_singular_set():

@@ -202,6 +202,7 @@ def both(p, s, now, log):
     return star.score(p, s, now, log), scores.mean(log.board.innovation.nis, now.t >= 100)
 
 
+@pytest.mark.slow
 def test_monte_carlo_is_consistent():
     n = 600
     out, _ = swept(healthy, n, params._replace(threshold=10.35))
@@ -211,6 +212,7 @@ def test_monte_carlo_is_consistent():
     assert out.ok.all()
 
 
+@pytest.mark.slow
 def test_unit_vectors_leave_two_degrees_of_freedom():
     out, _ = swept(healthy, 600, params._replace(unit=1.0))
     np.testing.assert_allclose(out.nis.mean(axis=1), 2, atol=0.01)
@@ -246,6 +248,7 @@ def _replayed(number, readings):
     return innovations((star.LMMSE, star.WITH_BIAS, star.TURN)[number], params, readings)
 
 
+@pytest.mark.slow
 def test_replay_is_the_run(run):
     board, readings, _ = run()
     again = _replayed(0, readings)
@@ -271,6 +274,7 @@ def test_seven_states_without_a_bias_are_the_four(run):
 # structure
 
 
+@pytest.mark.slow
 def test_a_window_on_board_is_that_of_detection():
     log = jaxatt.simulate(
         star.system_of(window=10), params, with_fault(PITCH, Fault(onset=2.0, bias=SIZE)), KEY, ticks=40
@@ -281,6 +285,7 @@ def test_a_window_on_board_is_that_of_detection():
 # gradients
 
 
+@pytest.mark.slow
 def test_the_likelihood_has_the_gradient_of_central_differences(run):
     readings = jax.tree.map(lambda a: a[:400], run()[1])
 

@@ -299,6 +299,7 @@ def test_the_wheel_loop_without_adaptation_is_its_linear_solution():
 
 
 @pytest.mark.parametrize("K", [1.5, 300.0])
+@pytest.mark.slow
 def test_sampled_eigenvalues_are_the_growth_of_a_run(K):
     """The slowest mode of the sampled wheel loop, stable and unstable, against two runs that start apart."""
     loop, ticks = wm.loop(sampled=True, substeps=5), 60

@@ -306,6 +306,7 @@ def test_noise_free_paper_case(noise_free):
     np.testing.assert_allclose(ideal, [512.10, 4245.15, 19257.49, 10293.49], atol=0.01)
 
 
+@pytest.mark.slow
 def test_integration_has_converged():
     """Spec, 1.2: 20 against 40 substeps, 6e-13 deg and 3.5e-7 deg/s there; the order of the method besides."""
     ends = [jaxatt.simulate(wm.loop(substeps=n), wm.params, QUIET, SILENCE[:2300], ticks=2300) for n in (10, 20, 40)]
@@ -327,6 +328,7 @@ def test_uniform_noise():
     np.testing.assert_allclose([log.a_r[-1, 0], log.a_y[-1, 0]], [0.670, -0.169], atol=1e-3)
 
 
+@pytest.mark.slow
 def test_gaussian_noise_and_the_scores_of_a_sweep():
     """Spec, 3.2: a standard deviation of 0.05/3 fits the paper (0.259 deg), one of 0.05 does not (0.355)."""
     n = 128
@@ -425,6 +427,7 @@ def test_momentum_and_torque():
 # failures
 
 
+@pytest.mark.slow
 def test_divergence_is_flagged_and_stays_in_its_lane():
     """Spec, 8.4: at 50 Hz gamma = 1e-6 diverges, 1e-8 does not; a mis-set sign diverges at once."""
     gains = [Adaptation(gamma=1e-6), Adaptation(gamma=1e-8), Adaptation(gamma=1e-8, sign=-1.0)]
@@ -456,6 +459,7 @@ def test_divergence_is_flagged_and_stays_in_its_lane():
     assert 15 < unstable_at[0] < 25.96
 
 
+@pytest.mark.slow
 def test_gradient_past_a_divergence_is_finite():
     system = wm.loop(sampled=True, substeps=2)
 
@@ -544,6 +548,7 @@ def test_bad_loop_and_bad_noise_are_refused():
     assert wm.loop() is wm.system
 
 
+@pytest.mark.slow
 def test_adaptation_too_fast_for_the_integration_is_warned_of():
     """sqrt(b gamma (r^2 + y^2)) = 122 rad/s at the peak with the paper's gamma."""
     fast = wm.mrac_only._replace(law=Adaptation(gamma=1e-4))
@@ -580,6 +585,7 @@ def test_on_board_code_gets_no_truth():
 # lanes, gradients, studies
 
 
+@pytest.mark.slow
 def test_lanes_vmap_and_single_runs_agree():
     rng = np.random.default_rng(5)
     n, ticks = 3, 150
@@ -607,6 +613,7 @@ def objective(theta, noise, ticks, system):
     return jnp.mean(log.error**2) + 1e-8 * jnp.mean(log.step**2)
 
 
+@pytest.mark.slow
 def test_gradient_is_the_central_difference():
     """Spec, 8.6."""
     ticks, system = 500, wm.loop(substeps=8)
@@ -620,6 +627,7 @@ def test_gradient_is_the_central_difference():
     assert np.all(np.abs(gradient) > 0)
 
 
+@pytest.mark.slow
 def test_single_precision_runs():
     single = lambda tree: jax.tree.map(lambda a: np.float32(a), tree)
     log = jaxatt.simulate(
