@@ -8,6 +8,7 @@ message. Imports nothing of jaxatt.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from functools import wraps
 from inspect import signature
@@ -161,6 +162,13 @@ def float_type(trees):
     """The floating type of a run: what the floating leaves promote to; Python numbers follow the others."""
     kinds = {leaf.dtype for leaf in jax.tree.leaves(trees) if hasattr(leaf, "dtype")}
     return jnp.result_type(1.0, *(kind for kind in kinds if jnp.issubdtype(kind, jnp.floating)))
+
+
+def precise(said: str, trees) -> None:
+    """Warn of a run in float32, in which what ``said`` says goes wrong; Python shows it once per line of the caller."""
+    if float_type(trees) == np.float32:
+        way_out = "Run in float64: jax.config.update('jax_enable_x64', True)."
+        warnings.warn(f"{said}. {way_out}", stacklevel=5)  # of simulate and sweep
 
 
 def converted(params, scenario) -> tuple[Any, Any]:

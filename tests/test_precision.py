@@ -8,18 +8,30 @@ import pytest
 
 from benchmarks.precision import NAMES, case, deviations
 from jaxatt.engine import admit
-from jaxatt.systems import gyro_ekf
+from jaxatt.systems import cmg_loss, gyro_ekf, observer_pd, star_isolation, wheel_mrac
+
+LOST = [  # system, params, scenario, what float32 loses of it
+    (gyro_ekf.system, gyro_ekf.consistent(gyro_ekf.params), gyro_ekf.scenario, "the filter's covariance"),
+    (gyro_ekf.system, gyro_ekf.params, gyro_ekf.scenario, None),
+    (gyro_ekf.direct, gyro_ekf.consistent(gyro_ekf.params), gyro_ekf.scenario, None),  # has no filter
+    (cmg_loss.system, cmg_loss.params, cmg_loss.scenario, "total momentum is not conserved"),
+    (cmg_loss.system, cmg_loss.params, cmg_loss.lost(54.7, (45, 45, 45, 45), brake=1e-3), None),
+    (star_isolation.system, star_isolation.params, star_isolation.scenario, "lines of sight"),
+    (star_isolation.system_of(star_isolation.TURN), star_isolation.params, star_isolation.scenario, None),
+    (observer_pd.system, observer_pd.params, observer_pd.scenario, None),
+    (wheel_mrac.system, wheel_mrac.params, wheel_mrac.scenario, None),
+]
 
 
-@pytest.mark.parametrize(("real", "consistent", "warned"), [("float32", 1, 1), ("float32", 0, 0), ("float64", 1, 0)])
-def test_precise_sensors_in_float32_are_warned_of_at_the_door(real, consistent, warned):
-    params = gyro_ekf.consistent(gyro_ekf.params) if consistent else gyro_ekf.params
-    given = jax.tree.map(lambda a: np.asarray(a, real), (params, gyro_ekf.scenario))
+@pytest.mark.parametrize("real", ["float32", "float64"])
+@pytest.mark.parametrize(("system", "params", "scenario", "lost"), LOST)
+def test_what_float32_loses_is_said_at_the_door(real, system, params, scenario, lost):
+    given = jax.tree.map(lambda a: np.asarray(a, real), (params, scenario))
     with warnings.catch_warnings(record=True) as met:
         warnings.simplefilter("always")
-        admit(gyro_ekf.system, *given)
-        admit(gyro_ekf.direct, *given)  # has no filter
-    assert len(met) == warned and all("float32" in str(w.message) for w in met)
+        admit(system, *given)
+    said = [str(warning.message) for warning in met if "float32" in str(warning.message)]
+    assert len(said) == (real == "float32" and lost is not None) and all(lost in words for words in said)
 
 
 def test_the_table_compares_the_same_run_in_both_types():

@@ -24,6 +24,7 @@ from jaxatt.singularity import condition_and_rank
 from jaxatt.vec import Mat3, Quat, Vec3, inverse, norm
 
 DT = 0.01  # [s] logs, scores, failures
+SUBSTEPS = 10  # integration steps of 1 ms in between
 PERIOD = 10  # ticks between control samples
 PYRAMID, BOX = 54.7, 90.0  # [deg] skew of the paper's structures
 MODULE = ModuleInertia(I_cr=5e-4, I_cs=1e-3, I_ct=5e-4, I_ws=1e-3)  # Table 4
@@ -283,6 +284,12 @@ def refuse_bad(params: Params, scenario: Scenario) -> tuple:
         check_gimbal_axes("scenario.axes", scenario.axes, np.isinf(np.asarray(scenario.failure.onset)))
         if scenario.known is not None:
             check_gimbal_axes("scenario.known", scenario.known)
+    if check.concrete((scenario.failure.brake, scenario.module.I_ws)):
+        slowing = DT / SUBSTEPS * np.asarray(scenario.failure.brake) / np.asarray(scenario.module.I_ws)
+        if np.any((slowing > 0) & (slowing < 1e-5)):  # python -m benchmarks.precision: momentum off by 5e-4 N m s
+            least = np.min(slowing, where=slowing > 0, initial=1)
+            said = f"`scenario.failure.brake` takes {least:.1g} of the wheel speed in a step: below 1e-5 float32 rounds"
+            check.precise(f"{said} the run-down, and the total momentum is not conserved", (params, scenario))
     return lanes
 
 
@@ -309,7 +316,7 @@ def lost(skew, gamma, module: int = 3, onset=0.0, brake=1e-6, free=0.0, friction
     return Scenario(np.radians(gamma), failure, cmg_axes(np.radians(skew), np.radians([0.0, 90.0, 180.0, 270.0])))
 
 
-system = System(init, tick, flow, dt=DT, substeps=10, normals=3, check=refuse_bad)
+system = System(init, tick, flow, dt=DT, substeps=SUBSTEPS, normals=3, check=refuse_bad)
 params = Params()
 table5 = Params(k_i=0.0)  # the paper's classes come with this one
 scenario = lost(PYRAMID, [45.0, 45.0, 45.0, 45.0])

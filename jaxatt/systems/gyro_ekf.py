@@ -8,7 +8,6 @@ in-lbf-s^2 (inertia); the published gains assume them. Choices and errata by num
 
 from __future__ import annotations
 
-import warnings
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -501,16 +500,13 @@ def refuse_bad(params: Params, scenario: Scenario) -> tuple:
 def refuse_bad_filter(params: Params, scenario: Scenario) -> tuple:
     """`refuse_bad`, and a warning where float32 does not carry the filter's covariance."""
     lanes = refuse_bad(params, scenario)
-    if check.concrete((params.P0, params.R)) and check.float_type((params, scenario)) == np.float32:
+    if check.concrete((params.P0, params.R)):
         P0, R = np.asarray(params.P0, float), np.asarray(params.R, float)
         prior = np.concatenate([P0[ANGLE], P0[RATE].max() + P0[BIAS], P0[WHEEL]])  # of the measurements
         least = np.min(R / np.maximum(prior, np.finfo(float).tiny))
         if least < 1e-6:  # python -m benchmarks.precision: NEES off by orders of magnitude, angles by 0.2 %
-            warnings.warn(
-                f"`params.R` is as small as {least:.1g} of the prior variance `params.P0`: below 1e-6 the covariance "
-                "of the filter is lost in float32. Run in float64: jax.config.update('jax_enable_x64', True).",
-                stacklevel=4,  # of simulate and sweep
-            )
+            said = f"`params.R` is as small as {least:.1g} of the prior variance `params.P0`: below 1e-6 float32 loses"
+            check.precise(f"{said} the filter's covariance", (params, scenario))
     return lanes
 
 

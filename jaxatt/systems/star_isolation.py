@@ -484,6 +484,11 @@ def refuse_bad(generator: Generator, params: Params, scenario: Scenario) -> tupl
     for name in ("star", "gyro", "actuator"):
         for axis, fault in getattr(scenario, name)._asdict().items():
             check_fault(f"scenario.{name}.{axis}", fault)
+    if generator.linear and check.concrete(params.std_star):
+        least = np.min(params.std_star)
+        if least < 1e-3:  # python -m benchmarks.precision: 3e-6 rad/s; evaluations and alarms are right to 2e-3
+            said = f"`params.std_star` = {least:.2g}: below 1e-3 the rounding of a quaternion near one in float32"
+            check.precise(f"{said} turns the estimates about their stars' lines of sight", (params, scenario))
     return lanes
 
 
