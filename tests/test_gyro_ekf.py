@@ -21,7 +21,7 @@ from jaxatt.mounting import along, gyro_pyramid, parity_vector, total, wheel_pyr
 from jaxatt.study import batch
 from jaxatt.systems import gyro_ekf
 from jaxatt.systems.gyro_ekf import ANGLE, BIAS, DEG, DT, Scenario, direct, failed, params, system
-from jaxatt.vec import Vec3, array, mat3
+from jaxatt.vec import Vec3, array, mat3, vec3
 
 jax.config.update("jax_enable_x64", True)
 
@@ -295,6 +295,21 @@ def test_printed_covariances_make_the_chi_square_mute(filtered):
 
 
 # the loop without the filter
+
+
+def test_direct_control_takes_the_pseudo_inverse_of_the_gyros_in_use():
+    G = matrix(gyro_pyramid(params.alpha, params.beta))
+    rng = np.random.default_rng(4)
+    gyro, angle, integral = rng.normal(0, 1e-4, (4, 16)), rng.normal(0, 1e-3, (3, 16)), rng.normal(0, 0.1, (3, 16))
+    valid, held = ~MASKS, np.zeros((4, 16))
+    maps = np.repeat(gyro_ekf.init_direct(params, Scenario())[1].board.maps[..., None], 16, axis=-1)
+    y = gyro_ekf.Readings(Reading(angle, angle == angle), Reading(gyro, valid), Reading(held, valid), held + 1, integral)
+    now = jaxatt.Now(jnp.asarray(0), jnp.asarray(0.0), DT)
+    board, _ = gyro_ekf.decide_direct(params, now, gyro_ekf.DirectBoard(held, maps), y)
+    w = np.stack([np.linalg.pinv(G[valid[:, i]]) @ gyro[valid[:, i], i] for i in range(16)], axis=-1)
+    u = gyro_ekf.command(params, now, y.up, vec3(integral), vec3(angle), vec3(w))
+    np.testing.assert_allclose(board.u, u, rtol=1e-9, atol=1e-12)
+    assert (np.ptp(board.u, axis=1) > 0).all()
 
 
 @pytest.mark.slow
