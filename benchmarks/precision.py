@@ -19,6 +19,7 @@ import numpy as np
 
 import jaxatt
 from jaxatt import simulate
+from jaxatt.systems import cmg_loss, gyro_ekf, observer_pd, star_isolation, wheel_mrac
 
 NAMES = (
     "observer_pd",
@@ -32,9 +33,7 @@ NAMES = (
 
 
 def case(name: str):
-    """System, params, scenario, seconds and ticks between records of a case; imported late, for imports may compute."""
-    from jaxatt.systems import cmg_loss, gyro_ekf, observer_pd, star_isolation, wheel_mrac
-
+    """System, params, scenario, seconds and ticks between records of a case."""
     match name:
         case "observer_pd":
             return observer_pd.system, observer_pd.params, observer_pd.scenario, 300.0, 1

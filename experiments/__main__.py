@@ -23,7 +23,7 @@ STUDIES = {"tune": "experiments.tuning"}  # words that may follow the names, and
 def main() -> int:
     if sys.argv[2:3] == ["campaign"]:
         jax.config.update("jax_enable_x64", True)
-        jaxatt.fast_cpu()  # before the loops are imported
+        jaxatt.fast_cpu()
         return importlib.import_module("experiments.campaigns").main(sys.argv[1], sys.argv[3:])
     parser = argparse.ArgumentParser(prog="python -m experiments", description=__doc__)
     words = f"of {', '.join(NAMES)}, none for all; then perhaps {', '.join(STUDIES)}"

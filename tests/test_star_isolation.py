@@ -52,7 +52,8 @@ def run():
 def test_the_spacecraft_starts_off_its_pointing_by_what_the_reference_says():
     q, w = scenario.q, scenario.w
     np.testing.assert_allclose(np.array(q[1:]) * 2 / DEG, [0.10, -0.08, 0.12], rtol=1e-5)
-    np.testing.assert_allclose((np.array(w) + [0, scenario.orbit_rate, 0]) / DEG, [2e-3, -1e-3, 1.5e-3], rtol=1e-9)
+    relative = w + Vec3(0.0, scenario.orbit_rate, 0.0)
+    np.testing.assert_allclose(np.array(relative) / DEG, [2e-3, -1e-3, 1.5e-3], rtol=1e-9)
 
 
 # the filter in plain matrices

@@ -66,16 +66,12 @@ def test_two_sets_of_numbers_compile_once(loop):
     assert score.traces == before
 
 
-def test_its_scores_are_tallies_with_a_flag(loop):
-    swept = sweep(loop.system, loop.params, batch(loop.scenario, 2), KEY, ticks=TICKS, score=loop.score)
-    assert swept.ok.shape == (2,) and swept.ok.dtype == bool and swept.ok.all()
-    assert all(a.shape[-1] == 2 for a in jax.tree.leaves(swept))
-
-
-def test_nan_in_one_scenario_is_flagged_and_leaves_the_others_alone(loop):
+def test_its_scores_are_tallies_and_nan_in_one_scenario_is_flagged_there_alone(loop):
     scenario = jax.tree.map(lambda a: np.array(a), batch(loop.scenario, 4))
     system = loop.system._replace(check=lambda params, scenario: None)
     clean = sweep(system, loop.params, scenario, KEY, ticks=TICKS, score=loop.score)
+    assert clean.ok.shape == (4,) and clean.ok.dtype == bool and clean.ok.all()
+    assert all(a.shape[-1] == 4 for a in jax.tree.leaves(clean))
     bad = next(leaf for leaf in jax.tree.leaves(scenario) if leaf.dtype.kind == "f")
     bad[..., 2] = np.nan
     hurt = sweep(system, loop.params, scenario, KEY, ticks=TICKS, score=loop.score)

@@ -39,12 +39,12 @@ from jaxatt.lmmse import (
     turn_update,
 )
 from jaxatt.sensors import read_triad, triad
-from jaxatt.vec import Mat3, Quat, Vec3, cross, diagonal, inverse, norm, once
+from jaxatt.vec import Mat3, Quat, Vec3, cross, inverse, norm, once
 
 DT = 0.1  # [s]
 ARCSEC = np.pi / 180 / 3600  # [rad]
 DEG = np.pi / 180  # [rad]
-INERTIA = diagonal((1200.0, 1000.0, 800.0))  # [kg m^2]
+INERTIA = Mat3(Vec3(1200.0, 0.0, 0.0), Vec3(0.0, 1000.0, 0.0), Vec3(0.0, 0.0, 800.0))  # [kg m^2]
 LINEAR_RANGE = 0.5 * DEG  # [rad] pointing error up to which C of eq. (7) holds (choice 6)
 ROLL, PITCH = 0, 1  # the star sensors, by the axis they look along
 
