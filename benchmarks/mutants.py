@@ -40,7 +40,7 @@ PHYSICS = (
 )  # fmt: skip
 TESTS = (
     "test_attitude", "test_vec", "test_faults", "test_detection", "test_theory", "test_observer_pd", "test_singularity",
-    "test_gyro_ekf", "test_cmg_loss", "test_star_isolation", "test_wheel_mrac",
+    "test_gyro_ekf", "test_cmg_loss", "test_star_isolation", "test_wheel_mrac", "test_objectives",
 )  # fmt: skip
 FRESH = multiprocessing.get_context("forkserver")  # processes that need not import JAX again
 LIMIT = 600  # [s] wall time of one mutant

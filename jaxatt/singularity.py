@@ -137,7 +137,7 @@ def min_norm_solve(t: Vec3, a: Vec3, rcond):
     full = jnp.stack(full) / jnp.where(total > 0, total, 1)
 
     u = _kernel(A - diagonal((l3, l3, l3)))
-    two = t @ (_inverse(A + (1 - l3) * Mat3(u.x * u, u.y * u, u.z * u)) @ (a - (u @ a) * u))
+    two = t @ (_inverse(A + Mat3(u.x * u, u.y * u, u.z * u)) @ (a - (u @ a) * u))
     one = t @ a / jnp.where(l1 > 0, l1, 1)
     least = rcond * rcond * l1
     return jnp.where(l3 > least, full, jnp.where(l2 > least, two, one))

@@ -114,7 +114,9 @@ def test_the_margins_of_the_papers_proof():
     m = op.margins(op.params, largest, q, w)
     assert abs(m.T - 31.7) < 0.05 and m.eps == pytest.approx(0.354348 - 0.1, abs=1e-6)
     assert abs(op.margins(op.params._replace(eps=0.00304), largest, q, w).T + 0.0206) < 1e-4
-    assert op.margins(op.params._replace(eps=0.00303032), largest).k_q == pytest.approx(0, abs=2e-3)
+    least = 330 - np.sqrt(330**2 - 2)  # root of k_q = eps / 2 + 1 / eps, eq. (18)
+    assert least == pytest.approx(0.00303032, abs=5e-9)
+    assert op.margins(op.params._replace(eps=least), largest).k_q == pytest.approx(0, abs=1e-7)
     low = op.margins(op.params._replace(k_w0=1.0), largest, q, w)
     assert low.T < 0
     gradient = jax.grad(lambda k: op.margins(op.params._replace(k_w0=k), largest, q, w).T)

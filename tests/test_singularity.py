@@ -167,6 +167,10 @@ def test_min_norm_solve_cuts_small_singular_values():
         T, a = left @ np.diag(sigma) @ right[:3], rng.normal(size=3)
         x = sg.min_norm_solve(Vec3(*jnp.asarray(T)), Vec3(*a), rcond)
         np.testing.assert_allclose(x, np.linalg.pinv(T, rcond) @ a, atol=1e-9)
+    for lost in range(3):  # rank two, whatever axis gets no torque
+        T = rng.normal(size=(3, 4)) * (np.arange(3) != lost)[:, None]
+        x = sg.min_norm_solve(Vec3(*jnp.asarray(T)), Vec3(0.3, -0.2, 0.5), 1e-8)
+        np.testing.assert_allclose(x, np.linalg.pinv(T) @ [0.3, -0.2, 0.5], atol=1e-12)
     T = np.outer([1.0, 2.0, 2.0], [1.0, 0.5, 1.0])
     x = sg.min_norm_solve(Vec3(*jnp.asarray(T)), Vec3(1.0, 0.0, 0.5), 1e-7)
     np.testing.assert_allclose(x, np.linalg.pinv(T) @ [1.0, 0.0, 0.5], atol=1e-12)

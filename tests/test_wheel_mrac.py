@@ -328,13 +328,14 @@ def test_uniform_noise():
     np.testing.assert_allclose([log.a_r[-1, 0], log.a_y[-1, 0]], [0.670, -0.169], atol=1e-3)
 
 
-def test_the_estimates_settling_is_its_last_time_off_by_half_a_percent():
+def test_scores_are_those_of_the_log():
     scenarios = batch(wm.scenario, 2)
     system = wm.loop(substeps=5)
     got = jaxatt.sweep(system, wm.params, scenarios, jax.random.key(3), ticks=1000, score=wm.score)
     log = jaxatt.rerun(system, wm.params, scenarios, jax.random.key(3), 1, ticks=1000)
     off = np.abs(np.asarray(log.J_hat) - wm.scenario.J_z) > 0.005 * wm.scenario.J_z
     assert off[0] and not off[-1] and got.J_settling[1] == pytest.approx(wm.DT * np.nonzero(off)[0][-1])
+    np.testing.assert_allclose(got.spans[0][1], np.ptp(log.r - log.r_ideal))
 
 
 @pytest.mark.slow
