@@ -100,7 +100,6 @@ def test_rank_one_is_seen():
     assert kappa == 1 and not rank_one
 
 
-@pytest.mark.slow
 def test_condition_has_finite_gradients():
     kappa = lambda g: sg.condition(cmg_triads(THREE["pyramid"], g).t)
     g = angles(3, 1)[:, 0]
