@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import wraps
 from inspect import signature
+from traceback import walk_tb
 from typing import Any, NoReturn, TypeVar
 
 import jax
@@ -46,31 +47,42 @@ def each(name: str, must: str, value, good) -> None:
         refuse(name, must, f"{float(value[bad]):g}", bad[-1] if bad else None)
 
 
+def real(name: str, value) -> np.ndarray:
+    """The value as an array; refuses, with TypeError, what holds no real numbers."""
+    try:
+        a = np.asarray(value)
+    except (TypeError, ValueError):
+        a = np.asarray(None)
+    if a.dtype.kind not in "biuf":
+        raise TypeError(f"`{name}` must hold real numbers, but it is {short(value)}.")
+    return a
+
+
 def positive(name: str, value) -> None:
     """Refuse numbers that are not finite and > 0."""
     if concrete(value):
-        value = np.asarray(value)
+        value = real(name, value)
         each(name, "be a positive number", value, (value > 0) & np.isfinite(value))
 
 
 def not_negative(name: str, value) -> None:
     """Refuse numbers that are not >= 0; inf passes."""
     if concrete(value):
-        value = np.asarray(value)
+        value = real(name, value)
         each(name, "not be negative", value, value >= 0)
 
 
 def above(name: str, value, least: float, reason: str) -> None:
     """Refuse numbers that are not > least; inf passes."""
     if concrete(value):
-        value = np.asarray(value)
+        value = real(name, value)
         each(name, f"be greater than {least:g} ({reason})", value, value > least)
 
 
 def between(name: str, value, low: float, high, reason: str) -> None:
     """Refuse numbers outside the open interval (low, high); reason says what bounds it."""
     if concrete((value, high)):
-        value, high = np.asarray(value), np.asarray(high)
+        value, high = real(name, value), np.asarray(high)
         inside = (value > low) & (value < high)
         each(name, f"lie in ({low:g}, {np.min(high):g}), {reason},", value, inside)
 
@@ -78,7 +90,7 @@ def between(name: str, value, low: float, high, reason: str) -> None:
 def one_of(name: str, value, allowed: tuple) -> None:
     """Refuse numbers that are none of the allowed ones."""
     if concrete(value):
-        value = np.asarray(value)
+        value = real(name, value)
         each(name, f"be one of {allowed}", value, np.isin(value, allowed))
 
 
@@ -86,7 +98,7 @@ def finite(name: str, tree) -> None:
     """Refuse NaN and infinities anywhere in a tree, by the path of the leaf."""
     for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
         if concrete(leaf):
-            leaf = np.asarray(leaf)
+            leaf = real(name + jax.tree_util.keystr(path), leaf)
             each(name + jax.tree_util.keystr(path), "be finite", leaf, np.isfinite(leaf))
 
 
@@ -94,7 +106,7 @@ def a_number(name: str, tree) -> None:
     """Refuse NaN anywhere in a tree, by the path of the leaf; infinities pass."""
     for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
         if concrete(leaf):
-            leaf = np.asarray(leaf)
+            leaf = real(name + jax.tree_util.keystr(path), leaf)
             each(name + jax.tree_util.keystr(path), "be a number", leaf, ~np.isnan(leaf))
 
 
@@ -279,8 +291,8 @@ F = TypeVar("F", bound=Callable)
 def door(f: F) -> F:
     """f, but what it cannot work with is refused in one line that names the argument.
 
-    Nothing is checked where f works, so that it costs nothing. For functions of numbers alone: what goes wrong in a
-    function that a caller hands in must be seen whole. An argument annotated with a NamedTuple must be one.
+    Nothing is checked where f works, so that it costs nothing. What goes wrong in a function that a caller hands in
+    is seen whole. An argument annotated with a NamedTuple must be one.
     """
     wanted = {name: str(p.annotation) for name, p in signature(f).parameters.items()}
 
@@ -288,9 +300,11 @@ def door(f: F) -> F:
     def at_the_door(*args, **kwargs):
         try:
             return f(*args, **kwargs)
-        except (TypeError, ValueError, AttributeError, IndexError, ArithmeticError, NotImplementedError) as error:
+        except (TypeError, ValueError, AttributeError, LookupError, ArithmeticError, NotImplementedError) as error:
             if isinstance(error, (jax.errors.JAXTypeError, jax.errors.JAXIndexError)):
                 raise  # a tracer where a number is needed: no fault of the input
+            if _from_outside(error, (*args, *kwargs.values())):
+                raise
             said = " ".join(str(error).split())
             try:
                 given = signature(f).bind(*args, **kwargs).arguments
@@ -303,25 +317,33 @@ def door(f: F) -> F:
     return at_the_door  # pyright: ignore[reportReturnType]
 
 
+def _from_outside(error: Exception, given) -> bool:
+    """Whether the error arose in one of the functions given."""
+    codes = {getattr(getattr(f, "func", f), "__code__", None) for f in given} - {None}
+    return any(frame.f_code in codes for frame, _ in walk_tb(error.__traceback__))
+
+
 def _subject(said: str) -> str:
     """The argument that a refusal names: what its first word begins with."""
     word = said[1:].split("`")[0]
     return "".join(c if c.isidentifier() or c.isdigit() else " " for c in word).split(" ")[0]
 
 
-def _blame(function: str, given: dict, wanted: dict, said: str) -> NoReturn:
+def _blame(called: str, given: dict, wanted: dict, said: str) -> NoReturn:
     for name, value in given.items():
         note = wanted[name]
         a_tuple = note.isidentifier() and note[0].isupper() and note not in ("Any", "Callable")
         if a_tuple and type(value).__name__ != note:
             raise TypeError(f"`{name}` must be a {note}, but it is {short(value)}.") from None
         if note.startswith("Callable"):
+            if not callable(value):
+                raise TypeError(f"`{name}` must be a function, but it is {short(value)}.") from None
             continue
         for leaf in jax.tree.leaves(value, is_leaf=lambda a: a is None):
             if not is_number(leaf) and not (leaf is None and "None" in note):
                 raise TypeError(f"`{name}` must hold real numbers, but it holds {short(leaf)}.") from None
     shapes = ", ".join(f"`{name}` has {_shapes(value)}" for name, value in given.items())
-    raise ValueError(f"`{function}` must get arguments that fit, but {shapes}: {said[:120]}") from None
+    raise ValueError(f"`{called}` must get arguments that fit, but {shapes}: {said[:120]}") from None
 
 
 def _shapes(value) -> str:
