@@ -1,6 +1,5 @@
 """The engine on a loop small enough to be written out in NumPy: a noisy oscillator under sampled feedback."""
 
-
 import jax
 import jax.numpy as jnp
 import numpy as np
