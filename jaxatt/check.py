@@ -8,9 +8,10 @@ message. Imports nothing of jaxatt.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import wraps
 from inspect import signature
+from pathlib import Path
 from traceback import walk_tb
 from typing import Any, NoReturn, TypeVar
 
@@ -56,6 +57,14 @@ def real(name: str, value) -> np.ndarray:
     if a.dtype.kind not in "biuf":
         raise TypeError(f"`{name}` must hold real numbers, but it is {short(value)}.")
     return a
+
+
+def number(name: str, value) -> float:
+    """Refuse what is not one real number; return it as float."""
+    a = real(name, value)
+    if a.shape != ():
+        refuse(name, "be one number", short(value))
+    return float(a)
 
 
 def positive(name: str, value) -> None:
@@ -141,6 +150,27 @@ def whole(name: str, value, least: int = 1) -> int:
     if value >= 2**31:
         refuse(name, "be less than 2147483648", short(value))
     return int(value)
+
+
+def wholes(name: str, values, least: int = 1) -> list[int]:
+    """Refuse what is not at least one whole number >= least, in a row; return them as a list."""
+    values = list(values) if np.iterable(values) else []
+    if not values:
+        refuse(name, "hold at least one whole number", short(values))
+    return [whole(f"{name}[{i}]", value, least) for i, value in enumerate(values)]
+
+
+def place(name: str, value) -> Path:
+    """Refuse, with TypeError, what names no file or folder; return it as a path."""
+    if not isinstance(value, (str, Path)) or "\0" in str(value):
+        raise TypeError(f"`{name}` must be a path, but it is {short(value)}.")
+    return Path(value)
+
+
+def mapping(name: str, value) -> None:
+    """Refuse, with TypeError, what is not a mapping."""
+    if not isinstance(value, Mapping):
+        raise TypeError(f"`{name}` must be a mapping, such as a dict, but it is {short(value)}.")
 
 
 def function(name: str, value) -> None:

@@ -104,6 +104,7 @@ def tune(
     check.function("cost", cost)
     check.function("optimizer.update", getattr(optimizer, "update", None))
     steps, key, theta = check.whole("steps", steps), one_key(key), _floats("theta", theta)
+    check.a_number("theta", theta)
     step = lambda search, key, k: _step(cost, optimizer, forward, fresh, search, key, k)
     best, history = _run(step, _start(optimizer, theta), steps, key, save, progress)
     return best.theta, history

@@ -32,13 +32,12 @@ jax.monitoring.register_event_duration_secs_listener(
 
 
 def judged(f, names, /, *args, **kwargs):
-    """Call f; True for a result, False for a refusal that is as it must be."""
-    before = len(compiled)
+    """Call f; the words of a refusal that is as it must be, or none for a result."""
     try:
         with warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore")
             jax.block_until_ready(jax.tree.leaves(f(*args, **kwargs)))
-        return True
+        return ""
     except (ValueError, TypeError) as error:
         said = str(error)
         assert "\n" not in said and len(said) < 1000, said
@@ -46,8 +45,7 @@ def judged(f, names, /, *args, **kwargs):
         assert named & set(names), (said, names)
         assert traceback.extract_tb(error.__traceback__)[-1].filename.startswith(HOME), said
         assert error.__suppress_context__ or error.__context__ is None, said
-        f.compiled = len(compiled) - before if hasattr(f, "compiled") else None
-        return False
+        return said
 
 
 # what a user may hand in
@@ -92,6 +90,15 @@ def tuples(kind, part=None, n=None):
     whole = st.tuples(*[part] * n).map(lambda parts: kind(*parts))
     same = arrays([(n,), (n, 2)]).map(lambda a: kind(*a))  # lanes that agree
     return st.one_of(same, whole, same, junk)
+
+
+@st.composite
+def nearly(draw, good, wild):
+    """Arguments by name: those of ``good``, which fit each other, none, one or two of them spoiled."""
+    made = {name: good[name] if name in good else draw(strategy) for name, strategy in wild.items()}
+    for name in draw(st.lists(st.sampled_from(list(wild)), max_size=2)):
+        made[name] = draw(wild[name])
+    return made
 
 
 vectors, quaternions = tuples(Vec3), tuples(Quat)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 from scipy.special import ndtri
-from toy import SYSTEM, Log, Params, Scenario, X
+from toy import SYSTEM, Params, Scenario
 
 import jaxatt
 from jaxatt import scores
