@@ -370,7 +370,13 @@ def _blame(called: str, given: dict, wanted: dict, said: str) -> NoReturn:
                 raise TypeError(f"`{name}` must be a function, but it is {short(value)}.") from None
             continue
         for leaf in jax.tree.leaves(value, is_leaf=lambda a: a is None):
-            if not is_number(leaf) and not (leaf is None and "None" in note):
+            if (
+                name == "key"
+                and not is_number(leaf)
+                and not jnp.issubdtype(getattr(leaf, "dtype", bool), jax.dtypes.prng_key)
+            ):
+                raise TypeError(f"`key` must be a key of jax.random.key(seed), but it is {short(leaf)}.") from None
+            if name != "key" and not is_number(leaf) and not (leaf is None and "None" in note):
                 raise TypeError(f"`{name}` must hold real numbers, but it holds {short(leaf)}.") from None
     shapes = ", ".join(f"`{name}` has {_shapes(value)}" for name, value in given.items())
     raise ValueError(f"`{called}` must get arguments that fit, but {shapes}: {said[:120]}") from None

@@ -21,7 +21,17 @@ from jaxatt.replay import checked, replay, resample, together
 from jaxatt.study import batch, rerun, sweep, varied
 from jaxatt.summary import columns, describe, failing, first_order, narrowed, quantiles, rate_of, rates, sensitivity
 from jaxatt.systems import observer_pd
-from jaxatt.tuning import tune
+from jaxatt.tuning import (
+    History,
+    averaged,
+    best_of,
+    bounded,
+    gradient_check,
+    multi_start,
+    tune,
+    value_and_gradient,
+    worst_case,
+)  # fmt: skip
 
 # the verbs, on a loop that compiles at once
 
@@ -102,7 +112,13 @@ VERBS = {
 }  # fmt: skip
 
 
-COSTLY = {"linear.sampled", "vmapped", "tune"}  # of which few examples may come to a result
+COSTLY = {
+    "linear.sampled",
+    "vmapped",
+    "tune",
+    "worst_case",
+    "multi_start",
+}  # of which few examples may come to a result
 GOOD = dict(
     system=LOOP, params=Params(), scenario=Scenario(), scenarios=batch(Scenario(), 2), noise_or_key=KEY, key=KEY, ticks=4, every=1,
     score=SCORES[0], index=1, states=None, pair=(Params(), Scenario()), cost=COSTS[0], theta=0.5, optimizer=optax.sgd(0.1), steps=2,
@@ -110,17 +126,75 @@ GOOD = dict(
 )  # fmt: skip
 
 
+def mixed(name, good, strategies):
+    wild = st.fixed_dictionaries(strategies)
+    return st.one_of(wild, wild, wild, nearly(good, strategies)) if name in COSTLY else nearly(good, strategies)
+
+
 @pytest.mark.parametrize("name", VERBS)
 def test_verbs(name):
     f, strategies, also = VERBS[name]
 
     @fuzzed
-    @given(st.fixed_dictionaries(strategies) if name in COSTLY else nearly(GOOD, strategies))
+    @given(mixed(name, GOOD, strategies))
     def run(arguments):
         before = len(compiled)
         said = judged(f, {*strategies, *also}, **arguments)
         if said and "with a finite gradient, at the start" not in said:  # which only a gradient can tell
             assert len(compiled) == before, "refused, but something was compiled"
+
+    run()
+
+
+# tuning
+
+
+trees = st.one_of(
+    good(-2, 2), plain(), arrays([(2,)]).map(lambda a: {"a": a}), st.just({"a": (1, 2.0)}), st.just({"a": np.zeros(2)})
+)
+history = st.one_of(
+    tuples(History), st.just(History({"a": np.zeros((2, 3))}, np.zeros((2, 3)), np.ones((2, 3)), np.ones((2, 3))))
+)
+directions = st.sampled_from([None, True, False])
+COSTS_MADE = [COSTS[0], COSTS[0], lambda theta, key: theta, None]
+TUNING = {
+    "value_and_gradient": (lambda cost, theta, key, forward: value_and_gradient(cost, theta, key, forward=forward),
+                           dict(cost=st.sampled_from(COSTS_MADE), theta=trees, key=keys, forward=directions)),
+    "multi_start": (lambda cost, thetas, optimizer, steps, key: multi_start(cost, thetas, optimizer, steps, key, progress=False),
+                    dict(cost=st.sampled_from(COSTS), thetas=trees, key=keys, steps=st.one_of(st.just(2), st.sampled_from([0, 2.5, "a"])),
+                         optimizer=st.sampled_from([optax.sgd(0.1), optax.sgd(0.1), None, 3]))),
+    "best_of": (best_of, dict(history=history)),
+    "averaged": (lambda cost, draws, theta, key: averaged(cost, draws)(theta, key),
+                 dict(cost=st.sampled_from([COSTS[0], None]), draws=whole, theta=st.sampled_from([0.5, np.ones(2)]), key=keys)),
+    "bounded": (lambda low, high, theta: (lambda b: b.within(b.free(theta)))(bounded(low, high)), dict(low=trees, high=trees, theta=trees)),
+    "within": (lambda low, high, theta: bounded(low, high).within(theta), dict(low=trees, high=trees, theta=trees)),
+    "worst_case": (lambda harm, low, high, optimizer, steps, key, starts: worst_case(
+        harm, low, high, optimizer, steps, key, starts=starts, progress=False),
+        dict(harm=st.sampled_from(COSTS), low=trees, high=trees, key=keys, steps=whole, starts=whole,
+             optimizer=st.sampled_from([optax.sgd(0.1), optax.sgd(0.1), None, 3]))),
+    "gradient_check": (lambda cost, theta, key, step, forward: gradient_check(cost, theta, key, step=step, forward=forward),
+                       dict(cost=st.sampled_from(COSTS_MADE), theta=trees, key=keys, step=st.one_of(st.none(), plain()), forward=directions)),
+}  # fmt: skip
+TOGETHER = GOOD | dict(
+    theta=np.full(2, 0.5), thetas=np.full((3, 2), 0.5), low=-1.0, high=1.0, harm=COSTS[0], starts=2, draws=2, step=1e-3, forward=None,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", TUNING)
+def test_tuning(name):
+    f, strategies = TUNING[name]
+
+    @fuzzed
+    @given(mixed(name, TOGETHER, strategies))
+    def run(arguments):
+        before = len(compiled)
+        said = judged(f, {name, *strategies, "thetas"}, **arguments)
+        if (
+            said
+            and "with a finite gradient, at the start" not in said
+            and name in ("multi_start", "worst_case", "averaged")
+        ):
+            assert len(compiled) == before, said
 
     run()
 
