@@ -191,7 +191,7 @@ def _run(step: Callable, search: _Search, steps: int, key, save, progress) -> tu
     lowered = compiled(step, 0).lower(search, key, np.int32(0))
     trail: list[History] = []
     if save is not None:
-        path, mark = Path(save), _mark(lowered, search, key)
+        path, mark = check.place("save", save), _mark(lowered, search, key)
         search, trail = _resumed(path, mark, search, steps)
     step = lowered.compile()
     with _bar(progress, steps, " steps") as bar:
@@ -237,18 +237,24 @@ def _resumed(path: Path, mark: str, search: _Search, steps: int) -> tuple[_Searc
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
         return search, []
-    with np.load(path, allow_pickle=False) as held:
-        if "mark" not in held or str(held["mark"]) != mark:
-            check.refuse("save", "hold a search of the same cost, start, optimizer, key and JAX", f"`{path}`")
-        back = lambda name, tree: jax.tree.unflatten(
-            jax.tree.structure(tree), [held[f"{name}{i}"] for i in range(len(jax.tree.leaves(tree)))]
-        )
-        history = back("history", History(search.theta, 0, 0, 0))
-        search = back("search", search)
-    done = len(history.cost)
+    read = lambda held, name, like: jax.tree.unflatten(
+        jax.tree.structure(like), [held[f"{name}{i}"] for i in range(len(jax.tree.leaves(like)))]
+    )
+    one = History(search.theta, search.factor, search.factor, search.factor)
+    try:
+        with np.load(path, allow_pickle=False) as held:
+            same = str(held["mark"]) == mark
+            was, history = read(held, "search", search), read(held, "history", one)
+        done = len(history.cost)
+        same &= all(jax.tree.leaves(jax.tree.map(lambda a, b: a.dtype == b.dtype and a.shape == b.shape, was, search)))
+        same &= all(jax.tree.leaves(jax.tree.map(lambda a, b: a.shape == (done, *np.shape(b)), history, one)))
+    except Exception:  # whatever NumPy says of another or a broken file
+        same, done = False, 0
+    if not same:
+        check.refuse("save", "hold a search of the same cost, start, optimizer, key and JAX", f"`{path}`")
     if steps < done:
         check.refuse("steps", f"not be fewer than the {done} that `{path}` holds", steps)
-    return search, [jax.tree.map(lambda a, k=k: a[k], history) for k in range(done)]
+    return was, [jax.tree.map(lambda a, k=k: a[k], history) for k in range(done)]
 
 
 # costs over many scenarios
@@ -383,7 +389,7 @@ def worst_case(
     starts, steps, key = check.whole("starts", starts), check.whole("steps", steps), one_key(key)
     check.finite("low", low)
     check.finite("high", high)
-    _bounds_of(low, low, high)
+    _bounds_of(_floats("low", low), low, high)
     key = jax.random.wrap_key_data(jnp.asarray(key))
     bounds = bounded(low, high)
     flat, unravel = ravel_pytree(_floats("low", low))

@@ -31,14 +31,14 @@ jax.monitoring.register_event_duration_secs_listener(
 )
 
 
-def judged(f, names, /, *args, **kwargs):
+def judged(f, names, /, *args, also=(), **kwargs):
     """Call f; the words of a refusal that is as it must be, or none for a result."""
     try:
         with warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore")
             jax.block_until_ready(jax.tree.leaves(f(*args, **kwargs)))
         return ""
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, *also) as error:
         said = str(error)
         assert "\n" not in said and len(said) < 1000, said
         named = {word for words in re.findall(r"`([^`]+)`", said) for word in re.findall(r"\w+", words)}
