@@ -171,18 +171,13 @@ def _table(path: Path):
             if kind == ".parquet":
                 return pyarrow.parquet.read_table(file).to_pandas(ignore_metadata=True)
             header = next(csv.reader([file.readline().decode("utf-8-sig").strip()]), [])
-            if len(set(header)) < len(header):
-                check.refuse("path", "name every column once", f"{path.name} with {sorted(header)}")
             names = [name.strip() for name in header]
-            return pandas.read_csv(file, header=None, names=names, index_col=False, float_precision="round_trip")
-        except (
-            pandas.errors.ParserError,
-            pandas.errors.EmptyDataError,
-            pyarrow.ArrowInvalid,
-            UnicodeDecodeError,
-        ) as error:
-            reason = str(error).splitlines()[0]
+            if len(set(names)) == len(names):
+                return pandas.read_csv(file, header=None, names=names, index_col=False, float_precision="round_trip")
+        except Exception as error:  # of pandas, PyArrow, the csv module or the decoder
+            reason = " ".join(str(error).split())[:200]
             raise ValueError(f"`path` must be a {kind[1:]} file, but {path.name} is none: {reason}") from None
+        check.refuse("path", "name every column once", f"{path.name} with {sorted(header)}")
 
 
 def _numbers(name: str, column) -> np.ndarray:
