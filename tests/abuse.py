@@ -31,6 +31,12 @@ jax.monitoring.register_event_duration_secs_listener(
 )
 
 
+def tidy():
+    """Forget the programs of one entry: those of every shape of 2000 examples of all entries fill the memory."""
+    if EXAMPLES > 50:
+        jax.clear_caches()
+
+
 def judged(f, names, /, *args, also=(), **kwargs):
     """Call f; the words of a refusal that is as it must be, or none for a result."""
     try:

@@ -205,6 +205,7 @@ def test_parts(f):
         judged(traced if f in BY_TRACE else f, [*wanted, f.__name__], **arguments)
 
     run()
+    tidy()
 
 
 # the shipped loops: their numbers, spoiled
@@ -269,6 +270,7 @@ def test_numbers_of_the_shipped_loops(name):
             assert len(compiled) == before, "refused, but something was compiled"
 
     run()
+    tidy()
 
 
 def admitted(system, params, scenario):

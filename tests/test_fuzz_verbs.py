@@ -8,7 +8,7 @@ import numpy as np
 import optax
 import pytest
 import xarray as xr
-from abuse import arrays, compiled, fuzzed, good, judged, junk, nearly, odd, plain, tuples, whole
+from abuse import arrays, compiled, fuzzed, good, judged, junk, nearly, odd, plain, tidy, tuples, whole
 from hypothesis import given
 from hypothesis import strategies as st
 from toy import SYSTEM, Params, Scenario
@@ -149,6 +149,7 @@ def test_verbs(name):
             assert len(compiled) == before, "refused, but something was compiled"
 
     run()
+    tidy()
 
 
 # tuning
@@ -202,6 +203,7 @@ def test_tuning(name):
             assert len(compiled) == before, said
 
     run()
+    tidy()
 
 
 # what draws, sums up and replays
@@ -300,6 +302,7 @@ def test_data(name):
         judged(f, {name, f"_{name}", *strategies, *ALSO}, **arguments)
 
     run()
+    tidy()
 
 
 # runs that no memory would hold
