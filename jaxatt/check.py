@@ -324,7 +324,10 @@ def door(f: F) -> F:
     Nothing is checked where f works, so that it costs nothing. What goes wrong in a function that a caller hands in
     is seen whole. An argument annotated with a NamedTuple must be one.
     """
-    wanted = {name: str(p.annotation) for name, p in signature(f).parameters.items()}
+    wanted = {
+        name: ("" if p.annotation is p.empty else str(p.annotation)) + (" | None" if p.default is None else "")
+        for name, p in signature(f).parameters.items()
+    }
 
     @wraps(f)
     def at_the_door(*args, **kwargs):
@@ -362,26 +365,31 @@ def _subject(said: str) -> str:
 def _blame(called: str, given: dict, wanted: dict, said: str) -> NoReturn:
     for name, value in given.items():
         note = wanted[name]
-        a_tuple = note.isidentifier() and note[0].isupper() and note not in ("Any", "Callable")
-        if a_tuple and type(value).__name__ != note:
-            raise TypeError(f"`{name}` must be a {note}, but it is {short(value)}.") from None
-        if note.startswith("Callable"):
-            if not callable(value):
-                raise TypeError(f"`{name}` must be a function, but it is {short(value)}.") from None
+        if value is None and "None" in note:
+            continue
+        kind = note.split("[")[0].split(" ")[0]
+        a_tuple = kind.isidentifier() and kind[0].isupper() and kind not in ("Any", "Axes", "Sequence")
+        its_type = (lambda a, k=kind: type(a).__name__ == k, f"a {kind}") if a_tuple else (lambda _: True, "")
+        fits, what = KINDS.get(kind, its_type)
+        if not fits(value):
+            raise TypeError(f"`{name}` must be {what}, but it is {short(value)}.") from None
+        if kind in ("Callable", "Axes") or "str" in note:
             continue
         for leaf in jax.tree.leaves(value, is_leaf=lambda a: a is None):
-            if (
-                name == "key"
-                and not is_number(leaf)
-                and not jnp.issubdtype(getattr(leaf, "dtype", bool), jax.dtypes.prng_key)
-            ):
-                raise TypeError(f"`key` must be a key of jax.random.key(seed), but it is {short(leaf)}.") from None
-            if name != "key" and not is_number(leaf) and not (leaf is None and "None" in note):
+            a_key = name == "key" and jnp.issubdtype(getattr(leaf, "dtype", bool), jax.dtypes.prng_key)
+            if not (is_number(leaf) or a_key or hasattr(leaf, "keys")):  # keys: a table, which has columns
                 raise TypeError(f"`{name}` must hold real numbers, but it holds {short(leaf)}.") from None
     shapes = ", ".join(f"`{name}` has {_shapes(value)}" for name, value in given.items())
     raise ValueError(f"`{called}` must get arguments that fit, but {shapes}: {said[:120]}") from None
 
 
+KINDS = {
+    "Callable": (callable, "a function"),
+    "Mapping": (lambda a: isinstance(a, Mapping), "a mapping"),
+    "str": (lambda a: isinstance(a, str), "a string"),
+}  # what an annotation asks for, beside NamedTuples and numbers
+
+
 def _shapes(value) -> str:
-    shapes = sorted({str(np.shape(leaf)) for leaf in jax.tree.leaves(value)})
+    shapes = sorted({str(np.shape(leaf)) for leaf in jax.tree.leaves(value) if is_number(leaf)})
     return f"shape {' and '.join(shapes[:3])}" if shapes else short(value)

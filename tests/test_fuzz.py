@@ -25,6 +25,7 @@ from abuse import (
     odd,
     plain,
     quaternions,
+    tidy,
     tuples,
     vectors,
     whole,

@@ -4,19 +4,23 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import matplotlib.pyplot as plt
 import numpy as np
 import optax
+import pandas
 import pytest
 import xarray as xr
-from abuse import arrays, compiled, fuzzed, good, judged, junk, nearly, odd, plain, tidy, tuples, whole
+from abuse import arrays, compiled, fault, fuzzed, good, judged, junk, nearly, odd, plain, tidy, tuples, vectors, whole
 from hypothesis import given
 from hypothesis import strategies as st
 from toy import SYSTEM, Params, Scenario
 
-from jaxatt import check, linear, scores
+from jaxatt import check, linear, plot, scores
 from jaxatt.designs import factorial, iid, latin, sobol, subsets
+from jaxatt.detection import Roc
 from jaxatt.engine import noise_of, simulate, vmapped
 from jaxatt.faults import Reading
+from jaxatt.mounting import GimbalAxes, cmg_axes
 from jaxatt.replay import checked, replay, resample, together
 from jaxatt.study import batch, rerun, sweep, varied
 from jaxatt.summary import columns, describe, failing, first_order, narrowed, quantiles, rate_of, rates, sensitivity
@@ -303,6 +307,67 @@ def test_data(name):
 
     run()
     tidy()
+
+
+# figures
+
+
+TABLE = {
+    "delay [s]": np.array([1.0, np.inf, 2.0]),
+    "size [1]": np.arange(1.0, 4.0),
+    "ok [1]": np.array([True, False, True]),
+}
+tables = st.one_of(
+    st.just(TABLE),
+    datasets(),
+    junk,
+    st.just(pandas.DataFrame(TABLE)),
+    st.dictionaries(st.sampled_from(list(TABLE)), plain(), max_size=3),
+)
+labels = st.sampled_from(["delay [s]", "size [1]", "ok [1]", "delay", "x", "", None, 3])
+label_words = st.one_of(st.none(), st.dictionaries(labels, labels, max_size=2), junk)
+curves = st.one_of(arrays([(3, 4)]).map(lambda a: Roc(*a)), tuples(Roc), plain())
+ax = st.sampled_from([None, None, 3, "a"])
+GIMBALS = cmg_axes(np.radians(54.7), np.radians([0.0, 90.0, 180.0, 270.0]))
+FIGURES = {
+    "column": dict(data=tables, name=labels),
+    "label_of": dict(data=tables, name=labels, labels=label_words),
+    "fault_times": dict(scenario=st.one_of(fault, plain(), st.just(observer_pd.scenario))),
+    "overview": dict(t=st.one_of(st.just(np.arange(3.0)), plain()), panels=st.one_of(st.dictionaries(labels, st.one_of(plain(), vectors)), junk),
+                     faults=st.one_of(st.none(), st.dictionaries(labels, plain(), max_size=2), junk), alarm=st.one_of(st.none(), plain()),
+                     thresholds=st.one_of(st.none(), st.dictionaries(labels, plain(), max_size=2), junk), axes=ax),
+    "heat_map": dict(data=tables, x=labels, y=labels, value=labels, bins=whole, log=st.sampled_from([(), ("size [1]",), "a", 3]),
+                     labels=label_words, chance=st.one_of(st.none(), plain()), ax=ax),
+    "sweep_summary": dict(data=tables, names=st.one_of(st.none(), st.lists(labels, max_size=2), junk), labels=label_words, axes=ax),
+    "roc": dict(curves=st.one_of(st.dictionaries(labels, curves, max_size=2), junk), samples=whole, least=plain(), ax=ax),
+    "front": dict(costs=st.one_of(arrays([(3, 2), (3,)]), plain())),
+    "pareto": dict(data=tables, x=labels, y=labels, labels=label_words, marked=st.one_of(
+        st.none(), st.dictionaries(labels, whole, max_size=2), junk), ax=ax),
+    "subsets": dict(out=st.one_of(arrays([(4, 2)]), plain()), values=st.one_of(st.dictionaries(labels, plain(), max_size=2), junk),
+                    names=st.sampled_from(["AB", "A", "", 3, None]), what=labels, axes=ax),
+    "singular_surface": dict(gimbals=tuples(GimbalAxes, vectors), reversed=whole, ax=ax, fine=st.one_of(st.just(4), whole)),
+}  # fmt: skip
+DRAWN = dict(data=TABLE, name="size [1]", x="size [1]", y="delay [s]", value="ok [1]", labels=None, scenario=observer_pd.scenario,
+             t=np.arange(3.0), panels={"size [1]": np.arange(3.0)}, faults={"gyro": 1.0}, thresholds=None, alarm=None, axes=None, ax=None,
+             bins=3, log=(), chance=None, names=None, curves={"a": Roc(*np.ones((3, 4)))}, samples=1, least=1e-3, costs=np.ones((3, 2)),
+             marked=None, out=np.eye(2) > 0, values={"size [1]": np.ones(2)}, what="units", gimbals=GIMBALS, reversed=0, fine=4)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_figures(name):
+    strategies = FIGURES[name]
+
+    @fuzzed
+    @given(nearly(DRAWN | {"names": "AB"} if name == "subsets" else DRAWN, strategies))
+    def run(arguments):
+        judged(
+            lambda **how: getattr(plot, name)(**how) and None,
+            {name, "label", *strategies, *ALSO, *map(str, TABLE)},
+            **arguments,
+        )
+        plt.close("all")
+
+    run()
 
 
 # runs that no memory would hold
