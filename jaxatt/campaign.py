@@ -221,14 +221,13 @@ def _admitted(campaign: Campaign) -> Campaign:
         if getattr(campaign, name) is not None or name in ("sample", "score"):
             check.function(f"campaign.{name}", getattr(campaign, name))
     check.mapping("campaign.units", campaign.units)
-    check.whole("campaign.ticks", campaign.ticks)
-    check.whole("campaign.every", campaign.every)
-    if check.whole("campaign.block", campaign.block) % BLOCK:
+    counts = {name: check.whole(f"campaign.{name}", getattr(campaign, name)) for name in ("ticks", "every", "block")}
+    if counts["block"] % BLOCK:
         check.refuse("campaign.block", f"be a multiple of {BLOCK}", campaign.block)
-    if campaign.size is not None:
-        check.whole("campaign.size", campaign.size)
+    counts["size"] = None if campaign.size is None else check.whole("campaign.size", campaign.size)
     params, _ = check.converted(campaign.params, ())
-    return campaign._replace(params=jax.tree.map(np.asarray, params), key=np.asarray(one_key(campaign.key)))
+    params = jax.tree.map(np.asarray, params)
+    return campaign._replace(params=params, key=np.asarray(one_key(campaign.key)), **counts)
 
 
 def _name(thing) -> str:

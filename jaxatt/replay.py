@@ -16,6 +16,7 @@ from __future__ import annotations
 import csv
 import re
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -181,15 +182,18 @@ def _table(path: Path):
 
 
 def _numbers(name: str, column) -> np.ndarray:
-    try:
+    with suppress(TypeError, ValueError):
         return np.asarray(column, float)
+    row = next(row for row, cell in enumerate(column) if not _is_number(cell))
+    check.refuse(name, "hold numbers", f"{column[row]!r} in row {row}")
+
+
+def _is_number(cell) -> bool:
+    try:
+        float(cell)
     except (TypeError, ValueError):
-        for row, cell in enumerate(column):
-            try:
-                float(cell)
-            except (TypeError, ValueError):
-                check.refuse(name, "hold numbers", f"{cell!r} in row {row}")
-        raise
+        return False
+    return True
 
 
 def checked(t, columns: Mapping[str, Any]) -> tuple[np.ndarray, dict[str, np.ndarray]]:

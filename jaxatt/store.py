@@ -128,6 +128,10 @@ def _check_metadata(manifest, variables, arrays) -> None:
             raise ValueError(f"its {name} is {manifest[name]!r}")
     if {OWN, *variables} != set(arrays):
         raise ValueError(f"it holds {', '.join(sorted(arrays))}")
+    lengths = {a.shape[-1] for name, a in arrays.items() if name != OWN and a.ndim} | {manifest["n"]}
+    blocks = {blocks_of(length, manifest["block"]) for length in lengths}  # two, where it was left while it grew
+    if max(lengths) >= 2**31 or arrays[OWN].shape not in {(count,) for count in blocks}:
+        raise ValueError(f"its arrays are of {sorted(lengths)} scenarios and {arrays[OWN].shape} blocks")
     for name, array in arrays.items():
         chunks = (1,) if name == OWN else (*(max(a, 1) for a in array.shape[:-1]), manifest["block"])
         if array.ndim == 0 or array.chunks != chunks:
