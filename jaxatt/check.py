@@ -375,7 +375,7 @@ def _blame(called: str, given: dict, wanted: dict, said: str) -> NoReturn:
             raise TypeError(f"`{name}` must be {what}, but it is {short(value)}.") from None
         if kind in ("Callable", "Axes") or "str" in note:
             continue
-        for leaf in jax.tree.leaves(value, is_leaf=lambda a: a is None):
+        for leaf in _leaves(value):
             a_key = name == "key" and jnp.issubdtype(getattr(leaf, "dtype", bool), jax.dtypes.prng_key)
             if not (is_number(leaf) or a_key or hasattr(leaf, "keys")):  # keys: a table, which has columns
                 raise TypeError(f"`{name}` must hold real numbers, but it holds {short(leaf)}.") from None
@@ -391,5 +391,12 @@ KINDS = {
 
 
 def _shapes(value) -> str:
-    shapes = sorted({str(np.shape(leaf)) for leaf in jax.tree.leaves(value) if is_number(leaf)})
+    shapes = sorted({str(np.shape(leaf)) for leaf in _leaves(value) if is_number(leaf)})
     return f"shape {' and '.join(shapes[:3])}" if shapes else short(value)
+
+
+def _leaves(value) -> list:
+    try:
+        return jax.tree.leaves(value, is_leaf=lambda a: a is None)
+    except ValueError:  # a dict whose keys have no order
+        return [value]
