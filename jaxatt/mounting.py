@@ -124,6 +124,9 @@ def check_gimbal_axes(name: str, axes: GimbalAxes, used: Any = True) -> None:
     check.kind(name, axes, GimbalAxes)
     for field, v in zip(GimbalAxes._fields, axes):
         check.kind(f"{name}.{field}", v, Vec3)
+        for axis, component in zip(Vec3._fields, v):
+            check.real(f"{name}.{field}.{axis}", component)
+    check.real("used", used)
     shapes = [np.shape(c) for v in check.numbers(name, axes) for c in v] + [np.shape(used)]
     if not _fit(shapes):
         check.refuse(name, "have components of one shape, that of `used` too", " and ".join(map(str, set(shapes))))

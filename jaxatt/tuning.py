@@ -328,13 +328,18 @@ def _bounds_of(theta, low, high):
             shape = check.real(name + path, end).shape
             if not all(a in (1, b) for a, b in zip_longest(shape[::-1], leaf.shape[::-1], fillvalue=1)):
                 check.refuse(name + path, f"broadcast to the shape {leaf.shape} of theta", shape)
-        check.each(f"low{path}", f"be less than high, {b}", a, np.asarray(a) < b)
+        check.each(f"low{path}", f"be less than high, {check.short(b)}", a, np.asarray(a) < b)
     return leaves, structure, ends, paths
 
 
 def _free(low, high, a, path):
     if check.concrete(a):
-        check.each(f"theta{path}", f"lie in ({low}, {high})", a, (np.asarray(a) > low) & (np.asarray(a) < high))
+        check.each(
+            f"theta{path}",
+            f"lie in ({check.short(low)}, {check.short(high)})",
+            a,
+            (np.asarray(a) > low) & (np.asarray(a) < high),
+        )
     no_low, no_high = _absent("low", low, path), _absent("high", high, path)
     if no_high:
         return jnp.asarray(a) if no_low else jnp.log(a - low)
