@@ -217,6 +217,8 @@ def _admitted(campaign: Campaign) -> Campaign:
     """The campaign with plain NumPy leaves, checked."""
     check.kind("campaign", campaign, Campaign)
     check.kind("campaign.system", campaign.system, System)
+    for name in ("init", "tick", "flow", "check"):
+        check.function(f"campaign.system.{name}", getattr(campaign.system, name))
     for name in ("sample", "score", "inputs", "record"):
         if getattr(campaign, name) is not None or name in ("sample", "score"):
             check.function(f"campaign.{name}", getattr(campaign, name))

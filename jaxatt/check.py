@@ -153,7 +153,7 @@ def whole(name: str, value, least: int = 1) -> int:
 
 
 def wholes(name: str, values, least: int = 1) -> list[int]:
-    """Refuse what is not at least one whole number >= least, in a row; return them as a list."""
+    """Refuse values that are not whole numbers >= least, at least one of them; return them as a list."""
     values = list(values) if np.iterable(values) else []
     if not values:
         refuse(name, "hold at least one whole number", short(values))
@@ -343,7 +343,8 @@ def door(f: F) -> F:
                 given = signature(f).bind(*args, **kwargs).arguments
             except TypeError as wrong:
                 raise TypeError(f"`{f.__name__}` must be called as {f.__name__}{signature(f)}: {wrong}.") from None
-            if isinstance(error, (TypeError, ValueError)) and said.startswith("`") and _subject(said) in given:
+            ours = isinstance(error, (TypeError, ValueError)) and said.startswith("`")
+            if ours and {_subject(said), _subject(said) + "s"} & set(given):  # one of the labels is a label
                 raise type(error)(said) from None
             _blame(f.__name__, given, wanted, said)
 
