@@ -223,7 +223,9 @@ def _admitted(campaign: Campaign) -> Campaign:
         if getattr(campaign, name) is not None or name in ("sample", "score"):
             check.function(f"campaign.{name}", getattr(campaign, name))
     check.mapping("campaign.units", campaign.units)
-    counts = {name: check.whole(f"campaign.{name}", getattr(campaign, name)) for name in ("ticks", "every", "block")}
+    counts: dict[str, Any] = {
+        name: check.whole(f"campaign.{name}", getattr(campaign, name)) for name in ("ticks", "every", "block")
+    }
     if counts["block"] % BLOCK:
         check.refuse("campaign.block", f"be a multiple of {BLOCK}", campaign.block)
     counts["size"] = None if campaign.size is None else check.whole("campaign.size", campaign.size)

@@ -378,7 +378,7 @@ def _blame(called: str, given: dict, wanted: dict, said: str) -> NoReturn:
             continue
         for leaf in _leaves(value):
             a_key = name == "key" and jnp.issubdtype(getattr(leaf, "dtype", bool), jax.dtypes.prng_key)
-            if not (is_number(leaf) or a_key or hasattr(leaf, "keys")):  # keys: a table, which has columns
+            if not (is_number(leaf) or a_key or hasattr(leaf, "keys") or hasattr(leaf, "plot")):  # a table, axes
                 raise TypeError(f"`{name}` must hold real numbers, but it holds {short(leaf)}.") from None
     shapes = ", ".join(f"`{name}` has {_shapes(value)}" for name, value in given.items())
     raise ValueError(f"`{called}` must get arguments that fit, but {shapes}: {said[:120]}") from None

@@ -150,7 +150,7 @@ def subsets(channels: int, most: int | None = None) -> np.ndarray:
     sizes, sets = range(min(most, channels) + 1), 0
     for size in sizes:
         sets += comb(channels, size)
-        check.fits_memory(f"`channels` = {channels} with `most` = {most}", sets * channels, "take fewer")
+        check.fits_memory(f"`channels` = {channels} with `most` = {most}", (sets + 40) * channels, "take fewer")
     chosen = np.zeros((sets, channels), bool)
     for row, who in zip(chosen, (who for size in sizes for who in combinations(range(channels), size))):
         row[list(who)] = True

@@ -160,7 +160,7 @@ def heat_map(
     log: tuple[str, ...] = (),
     labels: Mapping[str, str] | None = None,
     chance=None,
-    ax: Axes | None = None,
+    ax: Any = None,
 ) -> Axes:
     """Mean of a score over two quantities of the scenarios, such as the share of faults detected; empty cells blank.
 
@@ -240,7 +240,7 @@ def sweep_summary(
 
 
 @door
-def roc(curves: Mapping[str, detection.Roc], *, samples: int = 1, least: float = 1e-6, ax: Axes | None = None) -> Axes:
+def roc(curves: Mapping[str, detection.Roc], *, samples: int = 1, least: float = 1e-6, ax: Any = None) -> Axes:
     """Detection over false alarms for each `detection.Roc`, beside what luck gives.
 
     samples: how many independent samples one detection may use; the chance curve is `detection.chance` of that
@@ -277,7 +277,7 @@ def pareto(
     *,
     marked: Mapping[str, int] | None = None,
     labels: Mapping[str, str] | None = None,
-    ax: Axes | None = None,
+    ax: Any = None,
 ) -> Axes:
     """Designs by two costs, x and y, both to be small, with the front of those that no other one beats.
 

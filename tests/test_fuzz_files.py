@@ -150,7 +150,7 @@ FIELDS = dict(
     system=st.sampled_from([None, 3, TINY, TINY.system._replace(dt=0.2), TINY.system._replace(check=None)]),
     params=st.sampled_from([TINY.params._replace(gain=a) for a in ("a", -1.0, np.nan, np.zeros(2), np.float16(1), 1j, None)]),
     sample=st.sampled_from([None, 3, "a"]), key=plain(), ticks=rarely, score=functions,
-    inputs=functions, record=functions, every=rarely, block=st.one_of(whole, st.just(256)), size=whole,
+    inputs=functions, record=st.sampled_from([None, 3, "a"]), every=rarely, block=st.one_of(whole, st.just(256)), size=whole,
     units=st.sampled_from([{}, {"rms": 3}, {"colour": "m"}, None, "m", 3]),
 )  # fmt: skip
 ASKED = dict(

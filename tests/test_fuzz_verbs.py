@@ -286,7 +286,7 @@ DATA = {
              flow=st.sampled_from([None, None, lambda p, board, y: {"w": -board.w}, lambda p, board, y: board, lambda p, board, y: {"q": 1.0}, 3]),
              substeps=st.one_of(st.just(1), whole), between=st.one_of(st.none(), st.none(), arrays([(4, 1, 4), (4, 2, 4)]), junk))),
 }  # fmt: skip
-ALSO = {"time", "a", "b", "scenarios"}  # the channels and times that a message names
+ALSO = {"time", "a", "b", "q", "scenarios"}  # the channels and times that a message names
 
 
 fitting = GOOD | dict(
