@@ -362,7 +362,7 @@ def test_figures(name):
     def run(arguments):
         judged(
             lambda **how: (getattr(plot, name)(**how), None)[1],
-            {name, "label", *strategies, *ALSO, *map(str, TABLE)},
+            {name, "label", "name", *strategies, *ALSO, *map(str, TABLE)},
             **arguments,
         )
         plt.close("all")
