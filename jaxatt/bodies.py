@@ -6,10 +6,12 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
+from jaxatt.check import door
 from jaxatt.mounting import Triads
 from jaxatt.vec import Mat3, Vec3, cross, diagonal, inverse, once
 
 
+@door
 def body_acceleration(w: Vec3, u: Vec3, J: Mat3, J_inv: Mat3, sign=-1) -> Vec3:
     """dw/dt [rad/s^2] of a rigid body under torque u [N m]: J w' = -w x J w + u.
 
@@ -40,6 +42,7 @@ class Wheel(NamedTuple):
     creep: Any = 100.0  # [deg/s] speed eps over which friction turns round
 
 
+@door
 def wheel_acceleration(wheel: Wheel, y, u):
     """dy/dt [deg/s^2] of a wheel at speed y under the command u (docs/loops/wheel_mrac.md, choice 7).
 
@@ -52,11 +55,13 @@ def wheel_acceleration(wheel: Wheel, y, u):
     return beyond(driven - wheel.friction * fade * jnp.tanh(y / wheel.creep), wheel.stiction * fade)
 
 
+@door
 def beyond(u, width):
     """What of u lies beyond the dead zone [-width, width]; for no width u itself, its gradient included."""
     return jnp.where(jnp.abs(u) >= width, u - jnp.sign(u) * width, 0)
 
 
+@door
 def gated(u, gate):
     """u, or nothing where |u| < gate: a gate whose edge, a smooth step, is a tenth of it wide."""
     shut = gate > 0
@@ -67,6 +72,7 @@ def gated(u, gate):
 # rigid body with reaction wheels
 
 
+@door
 def wheeled_acceleration(w: Vec3, H: Vec3, T: Vec3, J: Mat3, J_inv: Mat3) -> Vec3:
     """dw/dt [rad/s^2] of a body whose wheels hold the momentum H and gain it at the rate T, both in body axes.
 
@@ -75,6 +81,7 @@ def wheeled_acceleration(w: Vec3, H: Vec3, T: Vec3, J: Mat3, J_inv: Mat3) -> Vec
     return J_inv @ (-T - cross(w, J @ w + H))
 
 
+@door
 def wheel_rate(u, h, torque_max, momentum_max):
     """What the wheels make of the commanded momentum rate u: limited, and none outward past momentum_max.
 
@@ -105,6 +112,7 @@ class CmgMotion(NamedTuple):
     spin: Any  # (n, *lanes) [rad/s^2] of the wheel speeds
 
 
+@door
 def cluster_inertia(J: Mat3, at: Triads, m: ModuleInertia) -> Mat3:
     """J_T of eq. (11) [kg m^2]: J_S + sum I_cr r r' + I_cs s s' + I_ct t t', using r r' + s s' + t t' = 1."""
     r, s = each_module(at.r), each_module(at.s)
@@ -112,6 +120,7 @@ def cluster_inertia(J: Mat3, at: Triads, m: ModuleInertia) -> Mat3:
     return sum((dyad(a, m.I_cr - m.I_ct) + dyad(b, m.I_cs - m.I_ct) for a, b in zip(r, s)), J + diagonal((o, o, o)))
 
 
+@door
 def cluster_momentum(w: Vec3, rate, spin, at: Triads, J_T: Mat3, m: ModuleInertia) -> Vec3:
     """h_T of eq. (11) [N m s] at gimbal rates ``rate`` and wheel speeds ``spin`` of shape (n, *lanes) [rad/s]."""
     h = J_T @ w
@@ -120,6 +129,7 @@ def cluster_momentum(w: Vec3, rate, spin, at: Triads, J_T: Mat3, m: ModuleInerti
     return h
 
 
+@door
 def cmg_motion(w: Vec3, rate, spin, at: Triads, J: Mat3, m: ModuleInertia, servo, brake, free, friction) -> CmgMotion:
     """How a spacecraft with a cluster moves without outer torque, Jin & Leeghim (2021), eqs. (11)-(12), any n.
 
@@ -150,6 +160,7 @@ def cmg_motion(w: Vec3, rate, spin, at: Triads, J: Mat3, m: ModuleInertia, servo
     return CmgMotion(w_change, jnp.stack(change), jnp.stack(spin_change))
 
 
+@door
 def each_module(v: Vec3) -> list[Vec3]:
     """The vectors, components of shape (*lanes), of a `Vec3` of shape (n, *lanes).
 
@@ -158,6 +169,7 @@ def each_module(v: Vec3) -> list[Vec3]:
     return [Vec3(*components) for components in zip(*v)]
 
 
+@door
 def dyad(v: Vec3, weight) -> Mat3:
     """weight v v'."""
     by = weight * v
@@ -167,6 +179,7 @@ def dyad(v: Vec3, weight) -> Mat3:
 # rigid body on a circular orbit
 
 
+@door
 def gravity_gradient(down: Vec3, J: Mat3, orbit_rate) -> Vec3:
     """Gravity-gradient torque 3 wo^2 z x J z [N m]; down: nadir z in body axes, a unit vector; orbit_rate [rad/s]."""
     return 3 * orbit_rate * orbit_rate * cross(down, J @ down)

@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxatt import check
-from jaxatt.engine import BLOCK, System, block_records, compiled, one_key
+from jaxatt.engine import BLOCK, System, block_records, compiled, one_key, tree_bytes
 from jaxatt.store import (
     OWN,
     Store,
@@ -38,6 +38,7 @@ from jaxatt.store import (
     metadata_lock,
     open_store,
     read_block,
+    readable,
     sized,
     state_of,
     sweep_up,
@@ -121,7 +122,8 @@ def _drawn(campaign: Campaign, start: int, stop: int):
 
 def scenarios(campaign: Campaign, start: int, stop: int):
     """The scenarios start .. stop - 1 in the last axis of every leaf, as `sweep` takes them."""
-    return _drawn(_admitted(campaign), start, stop)[0]
+    campaign, start = _admitted(campaign), check.whole("start", start, 0)
+    return _drawn(campaign, start, check.whole("stop", stop, start + 1))[0]
 
 
 def results(campaign: Campaign, start: int, stop: int, advance: Callable = lambda n: None) -> dict[str, np.ndarray]:
@@ -191,6 +193,8 @@ def _variables(campaign: Campaign) -> dict[str, Variable]:
     if campaign.record is not None:
         static = campaign.system, campaign.record, campaign.ticks, campaign.every
         records = compiled(block_records, 4).eval_shape(*static, params, scenarios, campaign.key, np.int32(0))
+        takes = tree_bytes(records) // BLOCK * campaign.block
+        check.fits_memory("`campaign.record` of a block", takes, "keep fewer records, by `every`")
         found += [("record", *item) for item in _named(records, "record").items()]
     variables = {}
     for role, name, a in found:
@@ -211,16 +215,23 @@ def _variables(campaign: Campaign) -> dict[str, Variable]:
 
 def _admitted(campaign: Campaign) -> Campaign:
     """The campaign with plain NumPy leaves, checked."""
-    for name in ("sample", "score"):
-        check.function(f"campaign.{name}", getattr(campaign, name))
-    check.whole("campaign.ticks", campaign.ticks)
-    check.whole("campaign.every", campaign.every)
-    if check.whole("campaign.block", campaign.block) % BLOCK:
+    check.kind("campaign", campaign, Campaign)
+    check.kind("campaign.system", campaign.system, System)
+    for name in ("init", "tick", "flow", "check"):
+        check.function(f"campaign.system.{name}", getattr(campaign.system, name))
+    for name in ("sample", "score", "inputs", "record"):
+        if getattr(campaign, name) is not None or name in ("sample", "score"):
+            check.function(f"campaign.{name}", getattr(campaign, name))
+    check.mapping("campaign.units", campaign.units)
+    counts: dict[str, Any] = {
+        name: check.whole(f"campaign.{name}", getattr(campaign, name)) for name in ("ticks", "every", "block")
+    }
+    if counts["block"] % BLOCK:
         check.refuse("campaign.block", f"be a multiple of {BLOCK}", campaign.block)
-    if campaign.size is not None:
-        check.whole("campaign.size", campaign.size)
+    counts["size"] = None if campaign.size is None else check.whole("campaign.size", campaign.size)
     params, _ = check.converted(campaign.params, ())
-    return campaign._replace(params=jax.tree.map(np.asarray, params), key=np.asarray(one_key(campaign.key)))
+    params = jax.tree.map(np.asarray, params)
+    return campaign._replace(params=params, key=np.asarray(one_key(campaign.key)), **counts)
 
 
 def _name(thing) -> str:
@@ -326,7 +337,7 @@ def run(path, campaign: Campaign, n: int, *, shard: tuple[int, int] = (0, 1), ex
     it); RuntimeError while another process writes the same blocks, and where a worker was lost; OSError where
     the disk is full. What is done is kept in all these cases.
     """
-    return _run(Path(path), campaign, n, False, shard, executor, accept, progress)
+    return _run(check.place("path", path), campaign, n, False, shard, executor, accept, progress)
 
 
 def extend(path, campaign: Campaign, n: int, **how) -> xr.Dataset:
@@ -336,17 +347,21 @@ def extend(path, campaign: Campaign, n: int, **how) -> xr.Dataset:
     does and has a `size` for that. Raises what `run` raises, FileNotFoundError where there is no store, and
     ValueError if n is less than there is.
     """
-    open_store(Path(path))
-    return _run(
-        Path(path), campaign, n, True, **{"shard": (0, 1), "executor": None, "accept": (), "progress": None, **how}
-    )
+    path = check.place("path", path)
+    open_store(path)
+    return _run(path, campaign, n, True, **{"shard": (0, 1), "executor": None, "accept": (), "progress": None, **how})
 
 
 def _run(path: Path, campaign: Campaign, n: int, grow: bool, shard, executor, accept, progress) -> xr.Dataset:
     campaign, n = _admitted(campaign), check.whole("n", n)
-    k, m = check.whole("shard[0]", shard[0], 0), check.whole("shard[1]", shard[1])
+    if isinstance(accept, str) or not all(isinstance(name, str) for name in (accept if np.iterable(accept) else [0])):
+        raise TypeError(f"`accept` must be names in the manifest, but it is {check.short(accept)}.")
+    if executor is not None:
+        check.function("executor.submit", getattr(executor, "submit", None))
+    k, *m = check.wholes("shard", shard, 0)
+    m = m[0] if len(m) == 1 else 0
     if k >= m:
-        check.refuse("shard", "be (k, m) with k < m", shard)
+        check.refuse("shard", "be (k, m) with k < m", check.short(shard))
     if campaign.size is not None and n > campaign.size:
         check.refuse("n", f"not exceed the {campaign.size} points of the design", n)
     with lock_file(path) as handle:
@@ -399,6 +414,12 @@ def _complete(store: Store, campaign: Campaign, mine: range, executor: Executor 
         for span, values in compute(list(spans)):
             if {*values, OWN} != {*store.arrays}:
                 check.refuse("campaign", f"give what the store holds, {sorted(store.arrays)}", sorted({*values, OWN}))
+            for name, a in values.items():
+                held = store.arrays[name]
+                if (held.dtype, held.shape[:-1]) != (a.dtype, a.shape[:-1]):
+                    check.refuse(
+                        "path", f"hold {name} as {a.dtype} of shape {a.shape[:-1]}", f"{held.dtype}, {held.shape[:-1]}"
+                    )
             write_block(store, spans[span], values)
 
 
@@ -472,15 +493,23 @@ def dataset(path) -> xr.Dataset:
 
     Raises RuntimeError if blocks are damaged or the store was left while it grew: run the campaign again.
     """
-    store = open_store(Path(path))
+    store = open_store(check.place("path", path))
     n = store.manifest["n"]
     if any(a.shape[-1] != n for name, a in store.arrays.items() if name != OWN):
-        raise RuntimeError(f"{store.path} was left while it grew: run or extend the campaign again.")
+        raise RuntimeError(
+            f"`path` must be whole, but {store.path} was left while it grew: run or extend the campaign again."
+        )
     states = [state_of(store, block) for block in range(blocks_of(n, store.manifest["block"]))]
     damaged = [block for block, state in enumerate(states) if state == "damaged"]
     if damaged:
-        raise RuntimeError(f"{store.path}: blocks {damaged} are damaged: run the campaign again to repair them.")
-    opened = xr.open_zarr(store.path, consolidated=False, chunks=None)[store.group.attrs["variables"]]
+        raise RuntimeError(
+            f"`path` must be whole, but blocks {damaged} are damaged in {store.path}: run the campaign again to repair them."
+        )
+    with readable(store.path):
+        opened = xr.open_zarr(store.path, consolidated=False, chunks=None, zarr_format=3)
+        opened = opened[store.group.attrs["variables"]]
+        if opened.sizes["scenario"] != n:
+            raise ValueError(f"its axis of scenarios has {opened.sizes['scenario']} of {n}")
     spans = [np.arange(*store.span(block)) for block, state in enumerate(states) if state == "done"]
     index = np.concatenate([np.arange(0), *spans])
     if len(index) < n:
@@ -493,7 +522,7 @@ def replay(path, campaign: Campaign, index: int):
 
     Raises ValueError if the campaign is not the one of the store, or the index is none of its scenarios.
     """
-    campaign, store = _admitted(campaign), open_store(Path(path))
+    campaign, store = _admitted(campaign), open_store(check.place("path", path))
     n = store.manifest["n"]
     _refuse_other(store.path, store.manifest, _manifest(campaign, n))
     if check.whole("index", index, 0) >= n:
@@ -516,11 +545,13 @@ def until(path, campaign: Campaign, looks, success: Callable, half_width: float,
 
     Returns the dataset up to the look at which it stopped, and the `Rate` there.
     """
-    looks = [check.whole("looks", look) for look in looks]
-    if not looks or sorted(set(looks)) != looks:
+    looks = check.wholes("looks", looks)
+    check.function("success", success)
+    if sorted(set(looks)) != looks:
         check.refuse("looks", "be growing numbers of scenarios", looks)
-    check.between("half_width", half_width, 0, 1, "a share")
-    path = Path(path)
+    check.between("half_width", check.number("half_width", half_width), 0, 1, "a share")
+    check.between("level", check.number("level", level), 0, 1, "a probability")
+    path = check.place("path", path)
 
     def counts():
         for n in looks:

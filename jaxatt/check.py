@@ -9,9 +9,11 @@ message. Imports nothing of jaxatt.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import wraps
 from inspect import signature
+from pathlib import Path
+from traceback import walk_tb
 from typing import Any, NoReturn, TypeVar
 
 import jax
@@ -47,31 +49,50 @@ def each(name: str, must: str, value, good) -> None:
         refuse(name, must, f"{float(value[bad]):g}", bad[-1] if bad else None)
 
 
+def real(name: str, value) -> np.ndarray:
+    """The value as an array; refuses, with TypeError, what holds no real numbers."""
+    try:
+        a = np.asarray(value)
+    except (TypeError, ValueError):
+        a = np.asarray(None)
+    if a.dtype.kind not in "biuf":
+        raise TypeError(f"`{name}` must hold real numbers, but it is {short(value)}.")
+    return a
+
+
+def number(name: str, value) -> float:
+    """Refuse what is not one real number; return it as float."""
+    a = real(name, value)
+    if a.shape != ():
+        refuse(name, "be one number", short(value))
+    return float(a)
+
+
 def positive(name: str, value) -> None:
     """Refuse numbers that are not finite and > 0."""
     if concrete(value):
-        value = np.asarray(value)
+        value = real(name, value)
         each(name, "be a positive number", value, (value > 0) & np.isfinite(value))
 
 
 def not_negative(name: str, value) -> None:
     """Refuse numbers that are not >= 0; inf passes."""
     if concrete(value):
-        value = np.asarray(value)
+        value = real(name, value)
         each(name, "not be negative", value, value >= 0)
 
 
 def above(name: str, value, least: float, reason: str) -> None:
     """Refuse numbers that are not > least; inf passes."""
     if concrete(value):
-        value = np.asarray(value)
+        value = real(name, value)
         each(name, f"be greater than {least:g} ({reason})", value, value > least)
 
 
 def between(name: str, value, low: float, high, reason: str) -> None:
     """Refuse numbers outside the open interval (low, high); reason says what bounds it."""
     if concrete((value, high)):
-        value, high = np.asarray(value), np.asarray(high)
+        value, high = real(name, value), np.asarray(high)
         inside = (value > low) & (value < high)
         each(name, f"lie in ({low:g}, {np.min(high):g}), {reason},", value, inside)
 
@@ -79,7 +100,7 @@ def between(name: str, value, low: float, high, reason: str) -> None:
 def one_of(name: str, value, allowed: tuple) -> None:
     """Refuse numbers that are none of the allowed ones."""
     if concrete(value):
-        value = np.asarray(value)
+        value = real(name, value)
         each(name, f"be one of {allowed}", value, np.isin(value, allowed))
 
 
@@ -87,7 +108,7 @@ def finite(name: str, tree) -> None:
     """Refuse NaN and infinities anywhere in a tree, by the path of the leaf."""
     for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
         if concrete(leaf):
-            leaf = np.asarray(leaf)
+            leaf = real(name + jax.tree_util.keystr(path), leaf)
             each(name + jax.tree_util.keystr(path), "be finite", leaf, np.isfinite(leaf))
 
 
@@ -95,7 +116,7 @@ def a_number(name: str, tree) -> None:
     """Refuse NaN anywhere in a tree, by the path of the leaf; infinities pass."""
     for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
         if concrete(leaf):
-            leaf = np.asarray(leaf)
+            leaf = real(name + jax.tree_util.keystr(path), leaf)
             each(name + jax.tree_util.keystr(path), "be a number", leaf, ~np.isnan(leaf))
 
 
@@ -130,6 +151,27 @@ def whole(name: str, value, least: int = 1) -> int:
     if value >= 2**31:
         refuse(name, "be less than 2147483648", short(value))
     return int(value)
+
+
+def wholes(name: str, values, least: int = 1) -> list[int]:
+    """Refuse values that are not whole numbers >= least, at least one of them; return them as a list."""
+    values = list(values) if np.iterable(values) else []
+    if not values:
+        refuse(name, "hold at least one whole number", short(values))
+    return [whole(f"{name}[{i}]", value, least) for i, value in enumerate(values)]
+
+
+def place(name: str, value) -> Path:
+    """Refuse, with TypeError, what names no file or folder; return it as a path."""
+    if not isinstance(value, (str, Path)) or "\0" in str(value):
+        raise TypeError(f"`{name}` must be a path, but it is {short(value)}.")
+    return Path(value)
+
+
+def mapping(name: str, value) -> None:
+    """Refuse, with TypeError, what is not a mapping."""
+    if not isinstance(value, Mapping):
+        raise TypeError(f"`{name}` must be a mapping, such as a dict, but it is {short(value)}.")
 
 
 def function(name: str, value) -> None:
@@ -287,28 +329,40 @@ F = TypeVar("F", bound=Callable)
 def door(f: F) -> F:
     """f, but what it cannot work with is refused in one line that names the argument.
 
-    Nothing is checked where f works, so that it costs nothing. For functions of numbers alone: what goes wrong in a
-    function that a caller hands in must be seen whole. An argument annotated with a NamedTuple must be one.
+    Nothing is checked where f works, so that it costs nothing. What goes wrong in a function that a caller hands in
+    is seen whole. An argument annotated with a NamedTuple must be one.
     """
-    wanted = {name: str(p.annotation) for name, p in signature(f).parameters.items()}
+    wanted = {
+        name: ("" if p.annotation is p.empty else str(p.annotation)) + (" | None" if p.default is None else "")
+        for name, p in signature(f).parameters.items()
+    }
 
     @wraps(f)
     def at_the_door(*args, **kwargs):
         try:
             return f(*args, **kwargs)
-        except (TypeError, ValueError, AttributeError, IndexError, ArithmeticError, NotImplementedError) as error:
+        except (TypeError, ValueError, AttributeError, LookupError, ArithmeticError, NotImplementedError) as error:
             if isinstance(error, (jax.errors.JAXTypeError, jax.errors.JAXIndexError)):
                 raise  # a tracer where a number is needed: no fault of the input
+            if _from_outside(error, (*args, *kwargs.values())):
+                raise
             said = " ".join(str(error).split())
             try:
                 given = signature(f).bind(*args, **kwargs).arguments
             except TypeError as wrong:
                 raise TypeError(f"`{f.__name__}` must be called as {f.__name__}{signature(f)}: {wrong}.") from None
-            if isinstance(error, (TypeError, ValueError)) and said.startswith("`") and _subject(said) in given:
+            ours = isinstance(error, (TypeError, ValueError)) and said.startswith("`")
+            if ours and {_subject(said), _subject(said) + "s"} & set(given):  # one of the labels is a label
                 raise type(error)(said) from None
             _blame(f.__name__, given, wanted, said)
 
     return at_the_door  # pyright: ignore[reportReturnType]
+
+
+def _from_outside(error: Exception, given) -> bool:
+    """Whether the error arose in one of the functions given."""
+    codes = {getattr(getattr(f, "func", f), "__code__", None) for f in given} - {None}
+    return any(frame.f_code in codes for frame, _ in walk_tb(error.__traceback__))
 
 
 def _subject(said: str) -> str:
@@ -317,21 +371,41 @@ def _subject(said: str) -> str:
     return "".join(c if c.isidentifier() or c.isdigit() else " " for c in word).split(" ")[0]
 
 
-def _blame(function: str, given: dict, wanted: dict, said: str) -> NoReturn:
+def _blame(called: str, given: dict, wanted: dict, said: str) -> NoReturn:
     for name, value in given.items():
         note = wanted[name]
-        a_tuple = note.isidentifier() and note[0].isupper() and note not in ("Any", "Callable")
-        if a_tuple and type(value).__name__ != note:
-            raise TypeError(f"`{name}` must be a {note}, but it is {short(value)}.") from None
-        if note.startswith("Callable"):
+        if value is None and "None" in note:
             continue
-        for leaf in jax.tree.leaves(value, is_leaf=lambda a: a is None):
-            if not is_number(leaf) and not (leaf is None and "None" in note):
+        kind = note.split("[")[0].split(" ")[0]
+        a_tuple = kind.isidentifier() and kind[0].isupper() and kind not in ("Any", "Axes", "Sequence")
+        its_type = (lambda a, k=kind: type(a).__name__ == k, f"a {kind}") if a_tuple else (lambda _: True, "")
+        fits, what = KINDS.get(kind, its_type)
+        if not fits(value):
+            raise TypeError(f"`{name}` must be {what}, but it is {short(value)}.") from None
+        if kind in ("Callable", "Axes") or "str" in note:
+            continue
+        for leaf in _leaves(value):
+            a_key = name == "key" and jnp.issubdtype(getattr(leaf, "dtype", bool), jax.dtypes.prng_key)
+            if not (is_number(leaf) or a_key or hasattr(leaf, "keys") or hasattr(leaf, "plot")):  # a table, axes
                 raise TypeError(f"`{name}` must hold real numbers, but it holds {short(leaf)}.") from None
     shapes = ", ".join(f"`{name}` has {_shapes(value)}" for name, value in given.items())
-    raise ValueError(f"`{function}` must get arguments that fit, but {shapes}: {said[:120]}") from None
+    raise ValueError(f"`{called}` must get arguments that fit, but {shapes}: {said[:120]}") from None
+
+
+KINDS = {
+    "Callable": (callable, "a function"),
+    "Mapping": (lambda a: isinstance(a, Mapping), "a mapping"),
+    "str": (lambda a: isinstance(a, str), "a string"),
+}  # what an annotation asks for, beside NamedTuples and numbers
 
 
 def _shapes(value) -> str:
-    shapes = sorted({str(np.shape(leaf)) for leaf in jax.tree.leaves(value)})
+    shapes = sorted({str(np.shape(leaf)) for leaf in _leaves(value) if is_number(leaf)})
     return f"shape {' and '.join(shapes[:3])}" if shapes else short(value)
+
+
+def _leaves(value) -> list:
+    try:
+        return jax.tree.leaves(value, is_leaf=lambda a: a is None)
+    except ValueError:  # a dict whose keys have no order
+        return [value]

@@ -7,16 +7,19 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jaxatt.check import door
 from jaxatt.mounting import GimbalAxes, cmg_triads
 from jaxatt.singularity import gram_determinant, min_norm_solve, robust_solve, times
 from jaxatt.vec import Mat3, Quat, Vec3, cross, diagonal, inverse, norm, safe_sqrt
 
 
+@door
 def pd(e_q: Vec3, e_w: Vec3, k_q, k_w) -> Vec3:
     """PD torque u = -k_q e_q - k_w e_w [N m], Yun & Kang (2020), eq. (10)."""
     return -(k_q * e_q) - k_w * e_w
 
 
+@door
 def rate_gain_floor(e_q: Vec3, eps, lambda_max):
     """h(e_q) [N m s], below which the adaptive rate gain does not fall; Yun & Kang (2020), after eq. (16).
 
@@ -25,6 +28,7 @@ def rate_gain_floor(e_q: Vec3, eps, lambda_max):
     return eps * lambda_max / 4 * (3 + 2 * norm(e_q) + 3 * e_q @ e_q) + 1.5
 
 
+@door
 def adapted_rate_gain(k_w, e_q: Vec3, e_w: Vec3, eps, lambda_max, dt):
     """The rate gain k_w [N m s] after dt [s] of the adaptation law, Yun & Kang (2020), eq. (19).
 
@@ -38,6 +42,7 @@ def adapted_rate_gain(k_w, e_q: Vec3, e_w: Vec3, eps, lambda_max, dt):
     return jnp.where(s > 0, h + safe_sqrt(jnp.maximum(s * s - c * c * dt / eps, 0)), k_w)
 
 
+@door
 def saturated(u: Vec3, u_max) -> Vec3:
     """u with every axis limited to +-u_max."""
     return Vec3(*(jnp.clip(a, -u_max, u_max) for a in u))
@@ -67,11 +72,13 @@ class Mrac(NamedTuple):
     a_y: Any  # [1] parameter on the plant's output
 
 
+@door
 def mrac_input(mrac: Mrac, r, y):
     """u = a_r r + a_y y [deg/s], Eun et al. (2016), eq. (5); r: reference input, y: plant output [deg/s]."""
     return mrac.a_r * r + mrac.a_y * y
 
 
+@door
 def mrac_flow(mrac: Mrac, law: Adaptation, r, y, a_m, b_m) -> Mrac:
     """Rate of change of the controller's state, Eun et al. (2016), eqs. (2), (4), (6).
 
@@ -86,6 +93,7 @@ def mrac_flow(mrac: Mrac, law: Adaptation, r, y, a_m, b_m) -> Mrac:
     )
 
 
+@door
 def mrac_step(mrac: Mrac, law: Adaptation, r, y, dt) -> Mrac:
     """The parameters after one forward-Euler step of the adaptation (6) over dt [s]; y_m is left alone.
 
@@ -97,6 +105,7 @@ def mrac_step(mrac: Mrac, law: Adaptation, r, y, dt) -> Mrac:
     return mrac._replace(a_r=jnp.clip(a_r, -law.limit, law.limit), a_y=jnp.clip(a_y, -law.limit, law.limit))
 
 
+@door
 def mrac_sampled_bound(law: Adaptation, dt, a_p, b_p, a_y=0.0):
     """The largest r^2 + y^2 [deg^2/s^2] at which `mrac_step` with a held command is stable.
 
@@ -116,6 +125,7 @@ def _projected(a, rate, limit):
 # PID, and its allocation to wheels
 
 
+@door
 def pid(angle: Vec3, integral: Vec3, w: Vec3, k_f: Vec3, k_p: Vec3, k_i: Vec3, k_d: Vec3) -> Vec3:
     """T = K_F (K_P angle + K_I integral + K_D w) per axis, Park (2005), eq. (5): a momentum rate of the wheels.
 
@@ -126,6 +136,7 @@ def pid(angle: Vec3, integral: Vec3, w: Vec3, k_f: Vec3, k_p: Vec3, k_i: Vec3, k
     return Vec3(*map(law, k_f, k_p, k_i, k_d, angle, integral, w))
 
 
+@door
 def allocation(T: Vec3, axes, up):
     """Least momentum rates u, shape (n, *lanes), of the wheels that are up, whose sum along their axes is T.
 
@@ -153,11 +164,13 @@ class Steering(NamedTuple):
     null: Any = 0.0  # [1/s] gain of null motion up the gradient of det T T'; no effect with three modules
 
 
+@door
 def rate_pi(e: Vec3, integral: Vec3, J_T: Mat3, k_p, k_i) -> Vec3:
     """PI torque demand J_T (k_p e + k_i integral) [N m] of the rate error e [rad/s], eq. (7)."""
     return J_T @ (k_p * e + k_i * integral)
 
 
+@door
 def steer(law: Steering, a: Vec3, axes: GimbalAxes, gamma, healthy, t):
     """Gimbal rates [rad/s], shape (n, *lanes), with T rate = a as nearly as the law allows.
 
@@ -174,6 +187,7 @@ def steer(law: Steering, a: Vec3, axes: GimbalAxes, gamma, healthy, t):
     return up + jnp.where(law.lam0 > 0, robust_solve(T, to_do, damping(law, T, t)), min_norm_solve(T, to_do, law.rcond))
 
 
+@door
 def damping(law: Steering, T: Vec3, t) -> Mat3:
     """lam E of the (generalised) singularity-robust inverse at time t [s]; E = 1 without dither."""
     lam = law.lam0 * jnp.exp(-law.mu * gram_determinant(T))
@@ -184,6 +198,7 @@ def damping(law: Steering, T: Vec3, t) -> Mat3:
 # quaternion PD
 
 
+@door
 def quaternion_pd(e: Quat, e_w: Vec3, w: Vec3, J: Mat3, bandwidth, damping) -> Vec3:
     """Torque [N m] u = -J (2 wn^2 sign(e_0) e_v + 2 zeta wn e_w) + w x J w: a linear second-order closed loop.
 

@@ -8,10 +8,10 @@ balanced only as a whole, and have a ``size``.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import combinations
-from math import prod
+from math import comb, prod
 from typing import Any, NamedTuple
 
 import jax
@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxatt import check
+from jaxatt.check import door
 
 
 class Design(NamedTuple):
@@ -40,6 +41,7 @@ def iid(dims: int) -> Design:
     return Design(partial(_iid, check.whole("dims", dims)), None)
 
 
+@door
 def _iid(dims, key, index):
     return _unit(jax.random.bits(jax.random.fold_in(key, index), (dims,), jnp.uint32))
 
@@ -48,11 +50,13 @@ def latin(n: int, dims: int) -> Design:
     """A Latin hypercube of n points: along every axis, one in each of n equal intervals.
 
     The whole of it is balanced, not a part: take all n scenarios, and do not extend. In float32 a point may fall
-    beside its interval by rounding.
+    beside its interval by rounding. Beyond n the points repeat.
     """
-    return Design(partial(_latin, check.whole("n", n), check.whole("dims", dims)), n)
+    n = check.whole("n", n)
+    return Design(partial(_latin, n, check.whole("dims", dims)), n)
 
 
+@door
 def _latin(n, dims, key, index):
     keys = jax.random.split(jax.random.fold_in(key, 2**32 - 1), dims)  # one permutation an axis
     within = _iid(dims, key, index)
@@ -78,7 +82,7 @@ def _permuted(n, key, index):
         left, right = jax.lax.fori_loop(0, 6, lambda i, pair: step(rounds[i], pair), (x >> half, x & mask))
         return (left << half) | right
 
-    start = once(jnp.asarray(index).astype(jnp.uint32))
+    start = once((jnp.asarray(index) % n).astype(jnp.uint32))  # beyond 4^half the walk would not end
     return jax.lax.while_loop(lambda x: x >= n, once, start)
 
 
@@ -97,6 +101,8 @@ def _directions(dims: int) -> np.ndarray:
     """Direction numbers (bits, dims) as 32-bit words, read off the sequence: point i is their sum over Gray(i)."""
     from scipy.stats import qmc
 
+    if dims > qmc.Sobol.MAXDIM:
+        check.refuse("dims", f"be at most {qmc.Sobol.MAXDIM}", dims)
     sequence = qmc.Sobol(dims, scramble=False, bits=32)
     rows, at = [], 0
     for bit in range(SOBOL_BITS):
@@ -107,6 +113,7 @@ def _directions(dims: int) -> np.ndarray:
     return np.stack(rows)
 
 
+@door
 def _sobol(directions, key, index):
     gray = index ^ (index >> 1)
     bits = (gray >> jnp.arange(len(directions))) & 1
@@ -118,12 +125,14 @@ def _sobol(directions, key, index):
 # combinations
 
 
-def factorial(index, counts: tuple[int, ...]) -> tuple[Any, ...]:
+@door
+def factorial(index, counts: Sequence[int]) -> tuple[Any, ...]:
     """The level of every factor in combination ``index`` of a full factorial; the last factor changes fastest.
 
     counts: levels of each factor; the whole has their product, after which it repeats, so an index beyond it
     gives a replicate. index: integers of any shape, which is that of every level.
     """
+    counts = check.wholes("counts", counts)
     index, levels = jnp.asarray(index) % prod(counts), []
     for count in reversed(counts):
         levels.append(index % count)
@@ -138,5 +147,11 @@ def subsets(channels: int, most: int | None = None) -> np.ndarray:
     """
     channels = check.whole("channels", channels)
     most = channels if most is None else check.whole("most", most, 0)
-    chosen = [who for size in range(min(most, channels) + 1) for who in combinations(range(channels), size)]
-    return np.array([[channel in who for channel in range(channels)] for who in chosen])
+    sizes, sets = range(min(most, channels) + 1), 0
+    for size in sizes:
+        sets += comb(channels, size)
+        check.fits_memory(f"`channels` = {channels} with `most` = {most}", (sets + 40) * channels, "take fewer")
+    chosen = np.zeros((sets, channels), bool)
+    for row, who in zip(chosen, (who for size in sizes for who in combinations(range(channels), size))):
+        row[list(who)] = True
+    return chosen

@@ -39,6 +39,7 @@ def windowed(evaluation, n: int):
 @door
 def threshold_nsigma(n, dof):
     """n^2 dof: every component of the residual n standard deviations off at once. dof = 3 N for N values of J."""
+    _numbers(n=n, dof=dof)
     return n * n * dof
 
 
@@ -51,7 +52,14 @@ def threshold_moment(n, dof):
 @door
 def threshold_mean(n, dof):
     """n dof: n times the mean of a chi-square number."""
+    _numbers(n=n, dof=dof)
     return n * dof
+
+
+def _numbers(**given) -> None:
+    for name, value in given.items():
+        if not check.is_number(value):  # a list times a number is a longer list
+            raise TypeError(f"`{name}` must be a number or an array, but it is {check.short(value)}.")
 
 
 @door

@@ -340,22 +340,27 @@ def block_scores(system: System, score: Callable, ticks: int, params, scenarios,
     key = _block_key(key, block)
     noise = partial(_block_noise, system, key, dtype)
 
+    def scored(now, log):
+        return jax.tree.map(lambda a: _in_lanes(a) if jnp.ndim(a) else a, score(params, scenarios, now, log))
+
     def fold(tally, now, log):
-        return scores.add(tally, score(params, scenarios, now, log)), None
+        return scores.add(tally, scored(now, log)), None
 
     def at_start():
         state = _start(system, params, scenarios, 1)
         now, _, log = _step(system, params, scenarios, jnp.asarray(0), state, noise(0)[0])
-        return score(params, scenarios, now, log)
+        return jax.tree.map(_in_lanes, scored(now, log))
 
-    shapes = jax.tree.map(lambda s: jax.ShapeDtypeStruct(_lane_shape(s.shape), s.dtype), jax.eval_shape(at_start))
+    shapes = jax.eval_shape(at_start)
     nothing = jax.tree.map(scores.empty, shapes, is_leaf=scores.is_tally)
     tally, _ = _run(system, params, scenarios, 1, ticks, CHUNK, noise, fold, nothing)
     return scores.values(tally)
 
 
-def _lane_shape(shape):
-    return shape if shape[-1:] == (BLOCK,) else (*shape, BLOCK)
+def _in_lanes(a):
+    """What is one number, or one array, for all lanes, in every lane."""
+    a = jnp.asarray(a)
+    return a if a.shape[-1:] == (BLOCK,) else jnp.broadcast_to(a[..., None], (*a.shape, BLOCK))
 
 
 def _block_noise(system, key, dtype, c):
@@ -367,7 +372,7 @@ def block_log(system: System, ticks: int, params, scenarios, key, block, lane):
     noise = partial(_block_noise, system, _block_key(key, block), check.float_type((params, scenarios)))
 
     def fold(none, now, log):
-        return none, jax.tree.map(lambda a: jnp.broadcast_to(a, _lane_shape(jnp.shape(a)))[..., lane], log)
+        return none, jax.tree.map(lambda a: _in_lanes(a)[..., lane], log)
 
     _, logs = _run(system, params, scenarios, 1, ticks, CHUNK, noise, fold, None)
     return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:ticks], logs)
@@ -378,7 +383,7 @@ def block_records(system: System, record: Callable, ticks: int, every: int, para
     noise = partial(_block_noise, system, _block_key(key, block), check.float_type((params, scenarios)))
 
     def fold(none, now, log):
-        return none, jax.tree.map(lambda a: jnp.broadcast_to(a, _lane_shape(jnp.shape(a))), record(log))
+        return none, jax.tree.map(_in_lanes, record(log))
 
     _, logs = _run(system, params, scenarios, 1, ticks, CHUNK, noise, fold, None)
     return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:ticks:every], logs)

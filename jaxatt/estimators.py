@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 
 from jaxatt.attitude import mrp_rate, mrp_rate_transposed
+from jaxatt.check import door
 from jaxatt.vec import Mat3, Vec3, cross, once, safe_sqrt
 
 
@@ -17,6 +18,7 @@ class AttitudeRate(NamedTuple):
     w: Any  # Vec3 [rad/s]
 
 
+@door
 def mrp_observer(
     estimate: AttitudeRate, y: AttitudeRate, u: Vec3, J: Mat3, J_inv: Mat3, alpha, beta, sign=-1
 ) -> AttitudeRate:
@@ -34,6 +36,7 @@ def mrp_observer(
     return AttitudeRate(q=mrp_rate(y.q, estimate.w) + alpha * xi_q, w=J_inv @ once(torque, xi_q, xi_w, u))
 
 
+@door
 def residual_norm(y: AttitudeRate, estimate: AttitudeRate):
     """|xi|: norm of reading minus estimate, MRP and rad/s added without weights as in the paper."""
     xi_q, xi_w = y.q - estimate.q, y.w - estimate.w
@@ -47,6 +50,7 @@ class LeastSquares(NamedTuple):
     P: Any  # [1/(W^2 s)] gain
 
 
+@door
 def least_squares(estimate: LeastSquares, W, y, dt, forget=0.0) -> LeastSquares:
     """The estimate after dt [s] in which the regressor W and the output y were constant.
 

@@ -106,6 +106,9 @@ def check_fault(name: str, fault: Fault) -> None:
     TypeError for what is no `Fault` of numbers.
     """
     check.kind(name, fault, Fault)
+    for field, value in zip(Fault._fields, fault):
+        if check.concrete(value):
+            check.real(f"{name}.{field}", value)
     check.a_number(name, check.numbers(name, fault))
     check.positive(f"{name}.tau", fault.tau)
     for field in ("random", "growth"):

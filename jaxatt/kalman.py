@@ -13,6 +13,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jaxatt import check
+from jaxatt.check import door
 from jaxatt.faults import Reading
 
 
@@ -23,6 +25,14 @@ class Belief(NamedTuple):
     cov: Any  # (n, n, *lanes), symmetric to the last bit
 
 
+def _arrays(belief: Belief) -> tuple[Any, Any]:
+    """Mean and covariance, which fit each other before a function of the caller meets them."""
+    x, P = map(jnp.asarray, belief)
+    if x.ndim == 0 or P.shape != (x.shape[0], *x.shape):
+        check.refuse("belief", "hold a mean (n, *lanes) and a cov (n, n, *lanes)", f"of shapes {x.shape} and {P.shape}")
+    return x, P
+
+
 class Evidence(NamedTuple):
     """What an update met. All of shape (*lanes)."""
 
@@ -31,6 +41,7 @@ class Evidence(NamedTuple):
     nll: Any  # [1] negative log-likelihood of the measurements used
 
 
+@door
 def ekf_predict(belief: Belief, f: Callable, steady, Q, dt) -> Belief:
     """The belief after dt [s] of x' = (f(x), steady), P' = A P + P A' + Q: one joint RK4 step, A at every stage.
 
@@ -38,7 +49,7 @@ def ekf_predict(belief: Belief, f: Callable, steady, Q, dt) -> Belief:
     which depend on no state; Q: (n,) or (n, *lanes), the diagonal spectral density of the process noise. A is
     never written down: `jax.linearize` of f takes the rows of P, which is symmetric, so A P is W' below.
     """
-    x, P = belief
+    x, P = _arrays(belief)
     n, m = x.shape[0], jax.eval_shape(f, x).shape[0]
     index = jnp.arange(n).reshape(n, *(1,) * (x.ndim - 1))
     steady = jnp.broadcast_to(steady, (n - m, *x.shape[1:]))
@@ -64,17 +75,20 @@ def ekf_predict(belief: Belief, f: Callable, steady, Q, dt) -> Belief:
     return Belief(x + dt / 6 * (k1 + 2 * (k2 + k3) + k4), jax.lax.map(lambda r: grown(W, r, dt), jnp.arange(n)))
 
 
+@door
 def innovation(belief: Belief, value, h: Callable, R):
     """Residual value - h(mean) and its variance, both (k, *lanes), each measurement for itself.
 
     h: a linear map that takes components in the leading axis, of a mean and of a covariance alike; R: (k,) or
     (k, *lanes) variances of the measurements.
     """
-    rows = h(belief.cov)
+    mean, cov = _arrays(belief)
+    rows = h(cov)
     variance = jax.lax.map(lambda ir: h(ir[1])[ir[0]], (jnp.arange(rows.shape[0]), rows))
-    return value - h(belief.mean), variance + R.reshape(R.shape + (1,) * (variance.ndim - R.ndim))
+    return value - h(mean), variance + R.reshape(R.shape + (1,) * (variance.ndim - R.ndim))
 
 
+@door
 def kalman_update(belief: Belief, y: Reading, h: Callable, R) -> tuple[Belief, Evidence]:
     """The belief after the measurements that are valid and finite; the others move neither mean nor covariance.
 
@@ -83,7 +97,7 @@ def kalman_update(belief: Belief, y: Reading, h: Callable, R) -> tuple[Belief, E
     of measurement i, whitened, so that P+ = P - D' D is symmetric by construction, and e the whitened innovation.
     float32 is precise while R exceeds 1e-6 of the prior variance (Table 5 of Park, 2005); below, take float64.
     """
-    x, P = belief
+    x, P = _arrays(belief)
     HP = h(P)
     k = HP.shape[0]
     lanes = x.shape[1:]
@@ -116,6 +130,7 @@ def kalman_update(belief: Belief, y: Reading, h: Callable, R) -> tuple[Belief, E
     return Belief(mean, cov), Evidence(nis, rows, nll)
 
 
+@door
 @jax.jit  # which keeps its loops compiled from call to call
 def nees(belief: Belief, truth):
     """Normalised estimation error squared e' P^-1 e, shape (*lanes); chi-square with n degrees of freedom.

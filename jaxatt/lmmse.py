@@ -7,11 +7,14 @@ function on the state, which serves the estimate and the rows of its covariance 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
+from jaxatt import check
 from jaxatt.attitude import quat_conjugate, quat_from_vector, quat_normalised, quat_rotate
+from jaxatt.check import door
 from jaxatt.vec import Mat3, Quat, Vec3, cross, det, diagonal, inverse, once
 
 
@@ -24,28 +27,40 @@ class Innovation(NamedTuple):
     log_det: Any  # () log det M
 
 
+@door
 def symmetric(rows):
     """A symmetric matrix, given by rows, by its upper triangle: what rounding did to the lower one is not computed."""
     n = range(len(rows))
     return tuple(tuple(rows[min(i, j)][max(i, j)] for j in n) for i in n)
 
 
-def congruence(f, P):
+@door
+def congruence(f: Callable, P):
     """F P F' of a symmetric P for the linear map f."""
-    return symmetric(tuple(f(column) for column in zip(*(f(row) for row in P))))
+    return symmetric(tuple(f(column) for column in zip(*(f(row) for row in _square(P)))))
 
 
+def _square(P):
+    """P, if it has as many columns as rows; asked before a function of the caller meets them."""
+    if any(len(row) != len(P) for row in P):
+        check.refuse("P", "be n rows of n", f"{len(P)} rows of {', '.join(str(len(row)) for row in P)}")
+    return P
+
+
+@door
 def outer(x):
     """x x'."""
     return tuple(tuple(a * b for b in x) for a in x)
 
 
+@door
 def plus(P, W):
     """P + W of two matrices by rows."""
     return tuple(tuple(a + b for a, b in zip(*rows)) for rows in zip(P, W))
 
 
-def update_three(x, P, y: Vec3, h, expected: Vec3, variance):
+@door
+def update_three(x, P, y: Vec3, h: Callable, expected: Vec3, variance):
     """Kalman update by three measurements at once: the state, its covariance and the `Innovation`.
 
     x, P: prediction, a tuple of n components and n rows; y: measurement; h: linear map of a state to the
@@ -60,7 +75,7 @@ def update_three(x, P, y: Vec3, h, expected: Vec3, variance):
         M_inv = inverse(M)
         return PH, M, M_inv, tuple(M_inv @ row for row in PH)  # K = P C' M^-1
 
-    PH, M, M_inv, K = once(gain, P)
+    PH, M, M_inv, K = once(gain, _square(P))
     r = y - expected
     x = type(x)(*(a + k @ r for a, k in zip(x, K)))
     P = symmetric(tuple(tuple(p - k @ c for p, c in zip(row, PH)) for row, k in zip(P, K)))  # P - K M K'
@@ -104,6 +119,7 @@ class Estimate(NamedTuple):
     P: Any  # n rows of n, shape (*lanes) each
 
 
+@door
 def quaternion_step(x: Quat, w: Vec3, w_r: Vec3, dt) -> Quat:
     """A(k) x: Euler's step of x' = (x w - w_r x) / 2, eqs. (2) and (3); linear in x.
 
@@ -113,12 +129,14 @@ def quaternion_step(x: Quat, w: Vec3, w_r: Vec3, dt) -> Quat:
     return x + (0.5 * dt) * (x * Quat(o, *w) - Quat(o, *w_r) * x)
 
 
+@door
 def star_map(x, s: Vec3) -> Vec3:
     """C x with C = [s, 2 [s x]], eq. (7): the star seen in body axes, to first order in the vector part of x."""
     x = Quat(*x[:4])
     return x.w * s + 2 * cross(s, x.v)
 
 
+@door
 def rate_noise(S, std, dt):
     """sum_i std^2 B_i S B_i' = (dt std / 2)^2 (tr(S) I - S): what gyro noise does to a quaternion of moment S.
 
@@ -129,6 +147,7 @@ def rate_noise(S, std, dt):
     return tuple(tuple(c * ((trace if i == j else 0) - S[i][j]) for j in range(4)) for i in range(4))
 
 
+@door
 def noise_moment(law, x, P, Q):
     """The second moment at which the multiplicative noise is evaluated, 4 rows of 4.
 
@@ -146,11 +165,13 @@ def noise_moment(law, x, P, Q):
     return symmetric(tuple(tuple(one(i, j) for j in range(4)) for i in range(4)))
 
 
+@door
 def lmmse_start(x: Quat, P) -> Moments:
     """The filter at the start: Q(0) = P(0) + x(0) x(0)'."""
     return Moments(x, P, plus(P, outer(x)))
 
 
+@door
 def lmmse_predict(e: Moments, w: Vec3, w_r: Vec3, std, dt, law=0.0) -> Moments:
     """Prediction over dt [s] with the gyro's reading w [rad/s] at its start; (11), (13), (15).
 
@@ -163,6 +184,7 @@ def lmmse_predict(e: Moments, w: Vec3, w_r: Vec3, std, dt, law=0.0) -> Moments:
     return Moments(A(e.x), plus(congruence(A, e.P), W), plus(congruence(A, e.Q), rate_noise(e.Q, std, dt)))
 
 
+@door
 def lmmse_update(e: Moments, y: Vec3, s: Vec3, std) -> tuple[Moments, Innovation]:
     """Update by the reading y of a star in direction s, reference components; (12), (14), (16).
 
@@ -173,6 +195,7 @@ def lmmse_update(e: Moments, y: Vec3, s: Vec3, std) -> tuple[Moments, Innovation
     return Moments(x, P, e.Q), innovation
 
 
+@door
 def bias_predict(e: Estimate, w: Vec3, w_r: Vec3, std, walk, dt) -> Estimate:
     """Prediction of `AttitudeBias` over dt [s]: `lmmse_predict` about the reading less the estimated bias.
 
@@ -194,6 +217,7 @@ def bias_predict(e: Estimate, w: Vec3, w_r: Vec3, std, walk, dt) -> Estimate:
     return Estimate(AttitudeBias(*quaternion_step(x.q, rate, w_r, dt), *x.b), plus(congruence(F, e.P), W))
 
 
+@door
 def bias_update(e: Estimate, y: Vec3, s: Vec3, std) -> tuple[Estimate, Innovation]:
     """Update of `AttitudeBias` by the reading of a star with noise std [1], as `lmmse_update`."""
     C = lambda x: star_map(x, s)
@@ -201,6 +225,7 @@ def bias_update(e: Estimate, y: Vec3, s: Vec3, std) -> tuple[Estimate, Innovatio
     return Estimate(x, P), innovation
 
 
+@door
 def turn_predict(e: Estimate, w: Vec3, w_r: Vec3, std, dt) -> Estimate:
     """Prediction of a multiplicative EKF: x a unit `Quat`, P of the small turn a in q = x exp(a / 2), 3 rows.
 
@@ -213,6 +238,7 @@ def turn_predict(e: Estimate, w: Vec3, w_r: Vec3, std, dt) -> Estimate:
     return Estimate(x, plus(congruence(rotate, e.P), W))
 
 
+@door
 def turn_update(e: Estimate, y: Vec3, s: Vec3, std) -> tuple[Estimate, Innovation]:
     """Update of a multiplicative EKF by the reading y of a star in direction s, with the exact residual y - A(x) s.
 

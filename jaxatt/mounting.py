@@ -124,12 +124,17 @@ def check_gimbal_axes(name: str, axes: GimbalAxes, used: Any = True) -> None:
     check.kind(name, axes, GimbalAxes)
     for field, v in zip(GimbalAxes._fields, axes):
         check.kind(f"{name}.{field}", v, Vec3)
+        for axis, component in zip(Vec3._fields, v):
+            check.real(f"{name}.{field}.{axis}", component)
+    check.real("used", used)
     shapes = [np.shape(c) for v in check.numbers(name, axes) for c in v] + [np.shape(used)]
     if not _fit(shapes):
         check.refuse(name, "have components of one shape, that of `used` too", " and ".join(map(str, set(shapes))))
     r, s0 = (np.stack(np.broadcast_arrays(*(np.asarray(c, float) for c in v))) for v in axes)
     if r.ndim < 2:
         check.refuse(f"{name}.r", "have shape (n, *lanes) with the modules first", f"of shape {r.shape[1:]}")
+    if np.broadcast_shapes(np.shape(used), r.shape[1:]) != r.shape[1:]:
+        check.refuse("used", f"have the shape of the axes, {r.shape[1:]}", np.shape(used))
     single = np.finfo(np.float32).eps  # axes may have been float32
     for field, v in (("r", r), ("s0", s0)):
         length = np.sqrt((v * v).sum(0))

@@ -9,7 +9,7 @@ Nothing in the package imports this module.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
@@ -21,6 +21,7 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from jaxatt import check, detection
 from jaxatt import singularity as sg
+from jaxatt.check import door
 from jaxatt.faults import Fault
 from jaxatt.mounting import GimbalAxes
 from jaxatt.vec import Vec3, array
@@ -34,6 +35,7 @@ MAP = "cividis"  # reads the same with and without colour vision
 # names, units and columns
 
 
+@door
 def column(data, name: str) -> np.ndarray:
     """One quantity of a dict, a NamedTuple, a dataset or a data frame, as an array.
 
@@ -45,6 +47,7 @@ def column(data, name: str) -> np.ndarray:
     return np.asarray(getattr(data, name) if hasattr(data, "_fields") else data[name])
 
 
+@door
 def label_of(data, name: str, labels: Mapping[str, str] | None = None) -> str:
     """The axis label of a quantity: of ``labels``, or its name with the unit that the data knows.
 
@@ -76,6 +79,7 @@ def _new(ax, **how) -> Any:
 # one run
 
 
+@door
 def fault_times(scenario) -> dict[str, float]:
     """The onsets [s] of the faults in a scenario, by the sensors or actuators at fault; of one scenario.
 
@@ -92,6 +96,7 @@ def fault_times(scenario) -> dict[str, float]:
     return {" and ".join(names) + " fault": onset for onset, names in sorted(found.items())}
 
 
+@door
 def overview(
     t,
     panels: Mapping[str, Any],
@@ -99,7 +104,7 @@ def overview(
     faults: Mapping[str, float] | None = None,
     thresholds: Mapping[str, float] | None = None,
     alarm=None,
-    axes=None,
+    axes: Any = None,
 ) -> np.ndarray:
     """One run over time: a panel for every quantity, fault onsets marked, thresholds dashed, alarms shaded.
 
@@ -144,8 +149,18 @@ def overview(
 # many runs
 
 
+@door
 def heat_map(
-    data, x: str, y: str, value: str, *, bins: int = 16, log: tuple[str, ...] = (), labels=None, chance=None, ax=None
+    data,
+    x: str,
+    y: str,
+    value: str,
+    *,
+    bins: int = 16,
+    log: tuple[str, ...] = (),
+    labels: Mapping[str, str] | None = None,
+    chance=None,
+    ax: Any = None,
 ) -> Axes:
     """Mean of a score over two quantities of the scenarios, such as the share of faults detected; empty cells blank.
 
@@ -185,7 +200,10 @@ def heat_map(
     return ax
 
 
-def sweep_summary(data, names=None, *, labels=None, axes=None) -> np.ndarray:
+@door
+def sweep_summary(
+    data, names: Sequence[str] | None = None, *, labels: Mapping[str, str] | None = None, axes: Any = None
+) -> np.ndarray:
     """The distribution of each score of a sweep: share of runs up to a value, its median, and how many have none.
 
     data: columns of shape (n,); names: which of them, all of shape (n,) by default. A score that is not finite
@@ -221,7 +239,8 @@ def sweep_summary(data, names=None, *, labels=None, axes=None) -> np.ndarray:
 # detectors and designs
 
 
-def roc(curves: Mapping[str, detection.Roc], *, samples: int = 1, least: float = 1e-6, ax=None) -> Axes:
+@door
+def roc(curves: Mapping[str, detection.Roc], *, samples: int = 1, least: float = 1e-6, ax: Any = None) -> Axes:
     """Detection over false alarms for each `detection.Roc`, beside what luck gives.
 
     samples: how many independent samples one detection may use; the chance curve is `detection.chance` of that
@@ -242,6 +261,7 @@ def roc(curves: Mapping[str, detection.Roc], *, samples: int = 1, least: float =
     return ax
 
 
+@door
 def front(costs) -> np.ndarray:
     """Which of the designs no other one beats: (n,) bool from costs (n, m), all of them to be small."""
     a = np.asarray(costs, float)
@@ -249,7 +269,16 @@ def front(costs) -> np.ndarray:
     return ~np.array(beaten, bool) & np.isfinite(a).all(axis=1)
 
 
-def pareto(data, x: str, y: str, *, marked: Mapping[str, int] | None = None, labels=None, ax=None) -> Axes:
+@door
+def pareto(
+    data,
+    x: str,
+    y: str,
+    *,
+    marked: Mapping[str, int] | None = None,
+    labels: Mapping[str, str] | None = None,
+    ax: Any = None,
+) -> Axes:
     """Designs by two costs, x and y, both to be small, with the front of those that no other one beats.
 
     data: columns of shape (n,); x and y name two of them. marked: names of designs, by their number, such as ``{"paper": 0}``.
@@ -270,7 +299,10 @@ def pareto(data, x: str, y: str, *, marked: Mapping[str, int] | None = None, lab
     return ax
 
 
-def subsets(out, values: Mapping[str, Any], *, names: str = "ABCD", what: str = "dead gyros", axes=None) -> np.ndarray:
+@door
+def subsets(
+    out, values: Mapping[str, Any], *, names: str = "ABCD", what: str = "dead gyros", axes: Any = None
+) -> np.ndarray:
     """A table of subsets, such as the sixteen of four gyros: what each gives, above the units that are out.
 
     out: (subsets, units) bool; names: a letter for each unit; what: the label of the table. values: by axis label with unit, (subsets,) or several of them by name; inf is
@@ -315,6 +347,7 @@ def subsets(out, values: Mapping[str, Any], *, names: str = "ABCD", what: str = 
 # momentum
 
 
+@door
 def singular_surface(gimbals: GimbalAxes, reversed: int = 0, ax: Any = None, *, fine: int = 80) -> Axes:
     """The singular momenta of a cluster with so many modules reversed, 0 for the envelope, and the rims of its holes.
 
@@ -322,6 +355,7 @@ def singular_surface(gimbals: GimbalAxes, reversed: int = 0, ax: Any = None, *, 
     module's, h_w. Circles and discs: a module's gimbal axis lies along the singular direction.
     """
     ax = plt.figure(figsize=(5.5, 5), layout="constrained").add_subplot(projection="3d") if ax is None else ax
+    check.fits_memory(f"`fine` = {fine}", 4000 * check.whole("fine", fine) ** 2, "take fewer")
     polar, around = np.meshgrid(np.linspace(0, np.pi, fine + 1), np.linspace(0, 2 * np.pi, 2 * fine + 1), indexing="ij")
     u = Vec3(np.sin(polar) * np.cos(around), np.sin(polar) * np.sin(around), np.cos(polar))
     n = gimbals.r.x.shape[0]

@@ -16,6 +16,7 @@ from __future__ import annotations
 import csv
 import re
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxatt import check
+from jaxatt.check import door
 from jaxatt.engine import Now, compiled, like, rk4
 from jaxatt.faults import Reading
 
@@ -57,9 +59,14 @@ def replay(
     Raises ValueError for readings that disagree about T, dt <= 0 or substeps < 1; TypeError for what is no number,
     and where ``decide`` returns a board of another structure, type or shape.
     """
-    check.positive("dt", dt)
+    check.function("decide", decide)
+    if flow is not None:
+        check.function("flow", flow)
+    check.positive("dt", check.number("dt", dt))
     substeps = check.whole("substeps", substeps)
     ticks = _length("readings", readings)
+    for name, tree in (("board", board), ("readings", readings), ("between", between)):
+        check.numbers(name, tree)
     params, (board, readings, between) = check.converted(params, (board, readings, between))
     for path, leaf in jax.tree_util.tree_leaves_with_path(between):
         if leaf.shape[:3] != (ticks, substeps, 4):
@@ -91,14 +98,17 @@ def _replay(decide, flow, dt, substeps, params, board, readings, between):
             at, seen = step
             stage = iter(range(4))  # rk4 asks for them in this order
 
-            def rates(t, x):
+            def rate(t, x):
                 i = next(stage)
                 now = y if seen is None else jax.tree.map(lambda a: a[i], seen)
                 return like(flow(params, board._replace(**x), now), x, "flow")
 
-            return rk4(rates, at, x, h), None
+            return rk4(rate, at, x, h), None
 
-        moving = {name: getattr(board, name) for name in jax.eval_shape(flow, params, board, y)}
+        rates = jax.eval_shape(flow, params, board, y)
+        if not isinstance(rates, dict) or not set(rates) <= set(getattr(board, "_fields", ())):
+            raise TypeError(f"`flow` must return a dict by fields of the board, but it is {check.short(rates)}.")
+        moving = {name: getattr(board, name) for name in rates}
         times = t + h * jnp.arange(substeps, dtype=dtype)
         return board._replace(**jax.lax.scan(one, moving, (times, stages))[0])
 
@@ -128,7 +138,8 @@ def load(path, units: Mapping[str, str], *, time: str = "time") -> tuple[np.ndar
     not finite, times that do not increase, and a file that cannot be read as what its name says; ImportError without
     pandas or pyarrow.
     """
-    path = Path(path)
+    path = check.place("path", path)
+    check.mapping("units", units)
     table = _table(path)
     there = {}
     for name in map(str, table.columns):
@@ -161,30 +172,28 @@ def _table(path: Path):
             if kind == ".parquet":
                 return pyarrow.parquet.read_table(file).to_pandas(ignore_metadata=True)
             header = next(csv.reader([file.readline().decode("utf-8-sig").strip()]), [])
-            if len(set(header)) < len(header):
-                check.refuse("path", "name every column once", f"{path.name} with {sorted(header)}")
             names = [name.strip() for name in header]
-            return pandas.read_csv(file, header=None, names=names, index_col=False, float_precision="round_trip")
-        except (
-            pandas.errors.ParserError,
-            pandas.errors.EmptyDataError,
-            pyarrow.ArrowInvalid,
-            UnicodeDecodeError,
-        ) as error:
-            reason = str(error).splitlines()[0]
-            raise ValueError(f"`path` must be a {kind[1:]} file, but {path.name} is none: {reason}") from error
+            if len(set(names)) == len(names):
+                return pandas.read_csv(file, header=None, names=names, index_col=False, float_precision="round_trip")
+        except Exception as error:  # of pandas, PyArrow, the csv module or the decoder
+            reason = " ".join(str(error).split())[:200]
+            raise ValueError(f"`path` must be a {kind[1:]} file, but {path.name} is none: {reason}") from None
+        check.refuse("path", "name every column once", f"{path.name} with {sorted(header)}")
 
 
 def _numbers(name: str, column) -> np.ndarray:
-    try:
+    with suppress(TypeError, ValueError):
         return np.asarray(column, float)
+    row = next(row for row, cell in enumerate(column) if not _is_number(cell))
+    check.refuse(name, "hold numbers", f"{column[row]!r} in row {row}")
+
+
+def _is_number(cell) -> bool:
+    try:
+        float(cell)
     except (TypeError, ValueError):
-        for row, cell in enumerate(column):
-            try:
-                float(cell)
-            except (TypeError, ValueError):
-                check.refuse(name, "hold numbers", f"{cell!r} in row {row}")
-        raise
+        return False
+    return True
 
 
 def checked(t, columns: Mapping[str, Any]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
@@ -193,7 +202,8 @@ def checked(t, columns: Mapping[str, Any]) -> tuple[np.ndarray, dict[str, np.nda
     Raises ValueError for times that are not finite or do not increase, infinite samples, a channel without any
     sample, and lengths that differ. Rows are counted from 0.
     """
-    t = np.asarray(t, float)
+    t = np.asarray(check.real("time", t), float)
+    check.mapping("columns", columns)
     if t.ndim != 1 or not len(t):
         check.refuse("time", "have shape (T,) with at least one sample", f"of shape {t.shape}")
     if not np.isfinite(t).all():
@@ -204,7 +214,7 @@ def checked(t, columns: Mapping[str, Any]) -> tuple[np.ndarray, dict[str, np.nda
         check.refuse("time", "increase from row to row", f"{t[row]:.9g} after {t[row - 1]:.9g} in row {row}")
     out = {}
     for name, values in columns.items():
-        out[name] = a = np.asarray(values, float)
+        out[name] = a = np.asarray(check.real(name, values), float)
         if a.shape != t.shape:
             check.refuse(name, f"have the shape {t.shape} of the times", a.shape)
         if np.isinf(a).any():
@@ -226,7 +236,7 @@ def resample(t, columns: Mapping[str, Any], *, dt: float, ticks: int | None = No
     Raises what `checked` raises, and ValueError for dt <= 0, ticks < 1 and times that span more than `SPARSE` ticks
     for each sample.
     """
-    check.positive("dt", dt)
+    check.positive("dt", check.number("dt", dt))
     t, columns = checked(t, columns)
     span = (t[-1] - t[0]) / dt
     if span > SPARSE * len(t):
@@ -234,6 +244,7 @@ def resample(t, columns: Mapping[str, Any], *, dt: float, ticks: int | None = No
             "time", f"span at most {SPARSE} ticks of {dt:g} s for each sample", f"{len(t)} samples in {span:.3g} ticks"
         )
     n = round(span) + 1 if ticks is None else check.whole("ticks", ticks)
+    check.fits_memory(f"`ticks` = {n} of {len(columns)} channels", 10 * n * len(columns), "ask for fewer")
     out = {}
     for name, a in columns.items():
         known = np.isfinite(a)
@@ -250,6 +261,10 @@ def resample(t, columns: Mapping[str, Any], *, dt: float, ticks: int | None = No
     return out
 
 
+@door
 def together(readings: Mapping[str, Reading], names) -> Reading:
     """Channels as one reading of shape (ticks, channels), in the order of the names."""
+    for name in names:
+        if name not in readings:
+            check.refuse("names", f"be channels ({', '.join(map(str, readings))})", check.short(name))
     return jax.tree.map(lambda *a: np.stack(a, axis=1), *(readings[name] for name in names))

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxatt.check import door
+from jaxatt.check import door, short
 from jaxatt.vec import safe_sqrt
 
 
@@ -168,6 +168,8 @@ def is_tally(node) -> bool:
 
 def empty(tally):
     """The tally of no tick, with the shapes and dtypes of the given one."""
+    if not is_tally(tally):
+        raise TypeError(f"`score` must return a tree of tallies, such as scores.rms(x), but it holds {short(tally)}.")
     return type(tally)(*(jnp.full(a.shape, d, a.dtype) for a, d in zip(tally, type(tally)())))
 
 

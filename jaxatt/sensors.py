@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from jaxatt.check import door
 from jaxatt.faults import channel, read
 from jaxatt.vec import Vec3
 
 
+@door
 def triad(faults: Vec3, t, std, normals, last: Vec3) -> Vec3:
     """The three channels of a star sensor or rate gyro from tick time t [s] on, a `Vec3` of `Channel`.
 
@@ -15,6 +17,7 @@ def triad(faults: Vec3, t, std, normals, last: Vec3) -> Vec3:
     return Vec3(*(channel(f, t, std, n, v) for f, n, v in zip(faults, normals, last)))
 
 
+@door
 def read_triad(channels: Vec3, truth: Vec3) -> Vec3:
     """The reading of a triad whose true signals are ``truth``."""
     return Vec3(*map(read, channels, truth))

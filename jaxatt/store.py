@@ -101,14 +101,41 @@ def open_store(path: Path, mode: Any = "r") -> Store:
     """
     if not path.exists():
         raise FileNotFoundError(f"`path` must be the store of a campaign, but there is nothing at {path}.")
+    with readable(path), zarr.config.set(_WHOLE):
+        group = zarr.open_group(path, mode=mode, zarr_format=3)
+        arrays = {name: array for name, array in group.arrays() if name != "time"}
+        manifest: Any = dict(group.attrs["campaign"])  # pyright: ignore
+        _check_metadata(manifest, group.attrs["variables"], arrays)
+    return Store(path, group, arrays, manifest)
+
+
+@contextmanager
+def readable(path: Path):
+    """Whatever Zarr and xarray say of broken metadata, as one ValueError."""
     try:
-        with zarr.config.set(_WHOLE):
-            group = zarr.open_group(path, mode=mode, zarr_format=3)
-            arrays = {name: array for name, array in group.arrays() if name != "time"}
-        manifest: Any = group.attrs["campaign"]
-    except (KeyError, FileNotFoundError, ValueError, TypeError) as error:
-        raise ValueError(f"`path` must be the store of a campaign, but {path} is not: {error}.") from error
-    return Store(path, group, arrays, dict(manifest))
+        yield
+    except Exception as error:
+        if isinstance(error, OSError) and not isinstance(error, FileNotFoundError):
+            raise
+        reason = " ".join(f"{type(error).__name__}: {error}".split())[:300]
+        raise ValueError(f"`path` must be the store of a campaign, but {path} is not: {reason}.") from None
+
+
+def _check_metadata(manifest, variables, arrays) -> None:
+    """Refuse what would send a reader astray."""
+    for name in ("n", "block"):
+        if type(manifest[name]) is not int or not 0 < manifest[name] < 2**31:
+            raise ValueError(f"its {name} is {manifest[name]!r}")
+    if {OWN, *variables} != set(arrays):
+        raise ValueError(f"it holds {', '.join(sorted(arrays))}")
+    lengths = {a.shape[-1] for name, a in arrays.items() if name != OWN and a.ndim} | {manifest["n"]}
+    blocks = {blocks_of(length, manifest["block"]) for length in lengths}  # two, where it was left while it grew
+    if max(lengths) >= 2**31 or arrays[OWN].shape not in {(count,) for count in blocks}:
+        raise ValueError(f"its arrays are of {sorted(lengths)} scenarios and {arrays[OWN].shape} blocks")
+    for name, array in arrays.items():
+        chunks = (1,) if name == OWN else (*(max(a, 1) for a in array.shape[:-1]), manifest["block"])
+        if array.ndim == 0 or array.chunks != chunks:
+            raise ValueError(f"{name} is not in chunks of one block")
 
 
 def sized(store: Store, n: int) -> Store:

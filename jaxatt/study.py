@@ -32,13 +32,21 @@ def sweep(system: System, params, scenarios, key, *, ticks: int, score: Callable
     """
     ticks, n = check.whole("ticks", ticks), check.lanes(scenarios)
     check.function("score", score)
-    params, scenarios = admit(system, params, scenarios, (n,))
+    params, scenarios = _admitted(system, params, scenarios, n)
     key = one_key(key)
     blocks = -(-n // BLOCK)
     if traced(params, scenarios, key):
         return _traced(system, score, ticks, params, scenarios, key, n, blocks)
     with _bar(progress, n, " scenarios") as bar:
         return scored(system, params, scenarios, key, ticks, score, advance=bar.update)
+
+
+def _admitted(system, params, scenarios, n):
+    """`admit` for n scenarios of which each must fit the params alone: params with lanes are `varied`'s."""
+    params, scenarios = admit(system, params, scenarios, (n,))
+    if any(np.shape(leaf)[-1:] == (n,) for leaf in jax.tree.leaves(params)):
+        admit(system, params, jax.tree.map(lambda leaf: leaf[..., 0], scenarios), ())
+    return params, scenarios
 
 
 def scored(system, params, scenarios, key, ticks, score, first: int = 0, advance: Callable = lambda n: None):
@@ -138,7 +146,7 @@ def rerun(system: System, params, scenarios, key, index: int, *, ticks: int):
     index = check.whole("index", index, 0)
     if index >= n:
         check.refuse("index", f"be less than the {n} scenarios", index)
-    params, scenarios = admit(system, params, scenarios, (n,))
+    params, scenarios = _admitted(system, params, scenarios, n)
     here = _lanes_of(jax.tree.map(np.asarray, scenarios), index // BLOCK)
     return logged(system, params, here, one_key(key), index, ticks)
 

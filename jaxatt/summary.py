@@ -12,6 +12,7 @@ import numpy as np
 from scipy import stats
 
 from jaxatt import check
+from jaxatt.check import door
 
 
 class Rate(NamedTuple):
@@ -27,9 +28,14 @@ class Rate(NamedTuple):
         return f"{share:.4g} ({self.low:.4g} to {self.high:.4g})"
 
 
+@door
 def rate_of(successes: int, trials: int, level: float = 0.95) -> Rate:
     """Clopper and Pearson's interval of successes in trials: it covers the true share with probability >= ``level``."""
-    k, n, tail = check.whole("successes", successes, 0), check.whole("trials", trials), (1 - level) / 2
+    k, n = check.whole("successes", successes, 0), check.whole("trials", trials)
+    if k > n:
+        check.refuse("successes", f"not exceed the {n} trials", k)
+    check.between("level", check.number("level", level), 0, 1, "a probability")
+    tail = (1 - level) / 2
     low = 0.0 if k == 0 else float(stats.beta.ppf(tail, k, n - k + 1))
     high = 1.0 if k == n else float(stats.beta.isf(tail, k + 1, n - k))
     return Rate(k, n, low, high)
@@ -42,22 +48,43 @@ def narrowed(counts: Iterable[int], looks, half_width: float, level: float = 0.9
     shared out equally among the looks (Bonferroni) and each interval is that of `rate_of`, so the one returned
     covers the rate of independent trials with probability of at least ``level``, wherever it stopped.
     """
+    looks = check.wholes("looks", looks)
+    check.positive("half_width", check.number("half_width", half_width))
+    check.between("level", check.number("level", level), 0, 1, "a probability")
+    if not np.iterable(counts):
+        raise TypeError(f"`counts` must be whole numbers, but they are {check.short(counts)}.")
+    rate = None
     for successes, n in zip(counts, looks):
+        if check.whole("counts", successes, 0) > n:
+            check.refuse("counts", f"not exceed the {n} trials", successes)
         rate = rate_of(successes, n, 1 - (1 - level) / len(looks))
         if (rate.high - rate.low) / 2 <= half_width:
             break
+    if rate is None:
+        check.refuse("counts", "hold at least one number", check.short(counts))
     return rate
+
+
+def _campaign(dataset):
+    if not hasattr(dataset, "data_vars"):
+        raise TypeError(f"`dataset` must be an xarray.Dataset, but it is {check.short(dataset)}.")
+    if "status" not in dataset or "scenario" not in dataset.coords:
+        check.refuse(
+            "dataset", "be that of a campaign, with status and scenario", f"one of {', '.join(map(str, dataset))}"
+        )
+    return dataset
 
 
 def columns(dataset, role: str) -> Iterator[tuple[str, np.ndarray]]:
     """The variables of a role, ``score`` or ``input``, one component (n,) at a time, by name: ``caught[2]``."""
-    for name, variable in dataset.data_vars.items():
+    for name, variable in _campaign(dataset).data_vars.items():
         if variable.attrs.get("role") == role:
             values = np.asarray(variable.values)
             for at in np.ndindex(values.shape[:-1]):
                 yield f"{name}[{', '.join(map(str, at))}]" if at else str(name), values[at]
 
 
+@door
 def rates(dataset, level: float = 0.95) -> dict[str, Rate]:
     """The share of every yes-or-no score, and of finite values among those that are not NaN, where some are infinite.
 
@@ -73,9 +100,11 @@ def rates(dataset, level: float = 0.95) -> dict[str, Rate]:
     return found
 
 
+@door
 def quantiles(dataset, levels=(0.05, 0.5, 0.95)) -> dict[str, np.ndarray]:
     """Quantiles at levels of every number among the scores, NaN left out: the inverse of the empirical distribution."""
-    found = {}
+    found, levels = {}, check.real("levels", levels)
+    check.each("levels", "lie in [0, 1]", levels, (levels >= 0) & (levels <= 1))
     for name, a in columns(dataset, "score"):
         a = a[~np.isnan(a)] if a.dtype.kind == "f" else a
         if a.dtype != bool and a.size:
@@ -83,6 +112,7 @@ def quantiles(dataset, levels=(0.05, 0.5, 0.95)) -> dict[str, np.ndarray]:
     return found
 
 
+@door
 def first_order(x, y) -> tuple[float, float]:
     """First-order index Var(E[y | x]) / Var(y) of two samples (n,), and its noise floor.
 
@@ -115,6 +145,7 @@ def first_order(x, y) -> tuple[float, float]:
     return float(corrected(between / np.sum(y * y))), float(corrected(odds / (1 + odds)))
 
 
+@door
 def sensitivity(dataset):
     """`first_order` of every score to every input: an xarray.Dataset with ``index`` and ``floor`` (score, input).
 
@@ -136,14 +167,17 @@ def sensitivity(dataset):
     return xr.Dataset(pair, coordinates)
 
 
+@door
 def failing(dataset) -> np.ndarray:
     """Indices of the scenarios that failed or were refused; `jaxatt.campaign.replay` shows any of them."""
+    dataset = _campaign(dataset)
     return dataset.scenario.values[dataset.status.values != 0]
 
 
+@door
 def describe(dataset) -> str:
     """A campaign in words: counts, then one line for each score, with the inputs that drive it most."""
-    status = dataset.status.values
+    status = _campaign(dataset).status.values
     n = status.size
     if not n:
         return "0 scenarios are done"

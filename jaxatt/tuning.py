@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Callable
+from itertools import zip_longest
 from math import gcd
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,12 +23,14 @@ from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh, PartitionSpec
 
 from jaxatt import check
+from jaxatt.check import door
 from jaxatt.engine import compiled, one_key
 from jaxatt.study import _bar
 
 FEW = 6  # numbers up to which forward mode is the cheaper
 
 
+@door
 def value_and_gradient(cost: Callable, theta, key, *, forward: bool | None = None):
     """cost(theta, key), a scalar, and its gradient, a tree like theta. Pure.
 
@@ -37,7 +40,7 @@ def value_and_gradient(cost: Callable, theta, key, *, forward: bool | None = Non
 
     Raises TypeError if the cost is no scalar.
     """
-    flat, unravel = ravel_pytree(theta)
+    flat, unravel = ravel_pytree(check.numbers("theta", theta))
     _scalar(cost, theta, key)
     if not (flat.size <= FEW if forward is None else forward):
         return jax.value_and_grad(cost)(theta, key)
@@ -101,9 +104,9 @@ def tune(
     Raises ValueError if the cost is not finite at the start, for steps < 1 or fewer than the file holds, and for a
     file of another search (cost, start, optimizer, key or release of JAX); TypeError if the cost is no scalar.
     """
-    check.function("cost", cost)
-    check.function("optimizer.update", getattr(optimizer, "update", None))
+    _check_search(cost, optimizer)
     steps, key, theta = check.whole("steps", steps), one_key(key), _floats("theta", theta)
+    check.a_number("theta", theta)
     step = lambda search, key, k: _step(cost, optimizer, forward, fresh, search, key, k)
     best, history = _run(step, _start(optimizer, theta), steps, key, save, progress)
     return best.theta, history
@@ -120,7 +123,8 @@ def multi_start(
 
     Raises what `tune` raises, for the start only if no start is finite.
     """
-    thetas = _floats("thetas", thetas)
+    _check_search(cost, optimizer)
+    steps, key, thetas = check.whole("steps", steps), one_key(key), _floats("thetas", thetas)
     sizes = {np.shape(leaf)[:1] for leaf in jax.tree.leaves(thetas)}
     if len(sizes) != 1 or () in sizes or (0,) in sizes:
         check.refuse("thetas", "lead with the same number of starts in every leaf", f"with {sorted(sizes)}")
@@ -131,11 +135,18 @@ def multi_start(
     return jax.tree.map(lambda a: a[np.argmin(best.cost)], best.theta), history
 
 
+@door
 def best_of(history: History):
     """The best theta of every start of a `multi_start`, a tree whose leaves lead with the starts; and their costs."""
     finite = np.where(np.isfinite(history.cost) & np.isfinite(history.gradient), history.cost, np.inf)
     at = np.argmin(finite, axis=0), np.arange(finite.shape[1])
     return jax.tree.map(lambda a: a[at], history.theta), finite[at]
+
+
+def _check_search(cost, optimizer) -> None:
+    check.function("cost", cost)
+    for name in ("init", "update"):
+        check.function(f"optimizer.{name}", getattr(optimizer, name, None))
 
 
 def _floats(name: str, theta):
@@ -180,7 +191,7 @@ def _run(step: Callable, search: _Search, steps: int, key, save, progress) -> tu
     lowered = compiled(step, 0).lower(search, key, np.int32(0))
     trail: list[History] = []
     if save is not None:
-        path, mark = Path(save), _mark(lowered, search, key)
+        path, mark = check.place("save", save), _mark(lowered, search, key)
         search, trail = _resumed(path, mark, search, steps)
     step = lowered.compile()
     with _bar(progress, steps, " steps") as bar:
@@ -226,18 +237,24 @@ def _resumed(path: Path, mark: str, search: _Search, steps: int) -> tuple[_Searc
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
         return search, []
-    with np.load(path, allow_pickle=False) as held:
-        if "mark" not in held or str(held["mark"]) != mark:
-            check.refuse("save", "hold a search of the same cost, start, optimizer, key and JAX", f"`{path}`")
-        back = lambda name, tree: jax.tree.unflatten(
-            jax.tree.structure(tree), [held[f"{name}{i}"] for i in range(len(jax.tree.leaves(tree)))]
-        )
-        history = back("history", History(search.theta, 0, 0, 0))
-        search = back("search", search)
-    done = len(history.cost)
+    read = lambda held, name, like: jax.tree.unflatten(
+        jax.tree.structure(like), [held[f"{name}{i}"] for i in range(len(jax.tree.leaves(like)))]
+    )
+    one = History(search.theta, search.factor, search.factor, search.factor)
+    try:
+        with np.load(path, allow_pickle=False) as held:
+            same = str(held["mark"]) == mark
+            was, history = read(held, "search", search), read(held, "history", one)
+        done = len(history.cost)
+        same &= all(jax.tree.leaves(jax.tree.map(lambda a, b: a.dtype == b.dtype and a.shape == b.shape, was, search)))
+        same &= all(jax.tree.leaves(jax.tree.map(lambda a, b: a.shape == (done, *np.shape(b)), history, one)))
+    except Exception:  # whatever NumPy says of another or a broken file
+        same, done = False, 0
+    if not same:
+        check.refuse("save", "hold a search of the same cost, start, optimizer, key and JAX", f"`{path}`")
     if steps < done:
         check.refuse("steps", f"not be fewer than the {done} that `{path}` holds", steps)
-    return search, [jax.tree.map(lambda a, k=k: a[k], history) for k in range(done)]
+    return was, [jax.tree.map(lambda a, k=k: a[k], history) for k in range(done)]
 
 
 # costs over many scenarios
@@ -251,11 +268,13 @@ def averaged(cost: Callable, draws: int) -> Callable:
 
     Raises ValueError for draws < 1.
     """
+    check.function("cost", cost)
     draws = check.whole("draws", draws)
     devices = jax.local_devices()
     devices = devices[: gcd(draws, len(devices))]
 
     def mean(theta, key):
+        one_key(key)
         one = lambda theta, keys: jax.lax.map(lambda key: cost(theta, key), keys)
         keys = jax.random.split(key, draws)
         if len(devices) > 1:
@@ -292,20 +311,35 @@ def bounded(low, high) -> Bounds:
     """
 
     def over(f, theta):
-        leaves, structure = jax.tree.flatten(theta)
-        spread = lambda b: jax.tree.leaves(b) if jax.tree.structure(b) == structure else [b] * len(leaves)
-        paths = [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(theta)]
-        ends = list(zip(spread(low), spread(high)))
-        for path, (a, b) in zip(paths, ends):
-            check.each(f"low{path}", f"be less than high, {b}", a, np.asarray(a) < b)
+        leaves, structure, ends, paths = _bounds_of(theta, low, high)
         return jax.tree.unflatten(structure, [f(*end, leaf, path) for end, leaf, path in zip(ends, leaves, paths)])
 
     return Bounds(lambda theta: over(_free, theta), lambda free: over(_within, free))
 
 
+def _bounds_of(theta, low, high):
+    """The leaves of theta, their structure, low and high of each, checked, and their paths."""
+    leaves, structure = jax.tree.flatten(_floats("theta", theta))
+    spread = lambda b: jax.tree.leaves(b) if jax.tree.structure(b) == structure else [b] * len(leaves)
+    paths = [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(theta)]
+    ends = list(zip(spread(low), spread(high)))
+    for path, leaf, (a, b) in zip(paths, leaves, ends):
+        for name, end in (("low", a), ("high", b)):
+            shape = check.real(name + path, end).shape
+            if not all(a in (1, b) for a, b in zip_longest(shape[::-1], leaf.shape[::-1], fillvalue=1)):
+                check.refuse(name + path, f"broadcast to the shape {leaf.shape} of theta", shape)
+        check.each(f"low{path}", f"be less than high, {check.short(b)}", a, np.asarray(a) < b)
+    return leaves, structure, ends, paths
+
+
 def _free(low, high, a, path):
     if check.concrete(a):
-        check.each(f"theta{path}", f"lie in ({low}, {high})", a, (np.asarray(a) > low) & (np.asarray(a) < high))
+        check.each(
+            f"theta{path}",
+            f"lie in ({check.short(low)}, {check.short(high)})",
+            a,
+            (np.asarray(a) > low) & (np.asarray(a) < high),
+        )
     no_low, no_high = _absent("low", low, path), _absent("high", high, path)
     if no_high:
         return jnp.asarray(a) if no_low else jnp.log(a - low)
@@ -355,9 +389,13 @@ def worst_case(
 
     Raises ValueError as `multi_start` does, and for starts < 1.
     """
-    starts = check.whole("starts", starts)
+    check.function("harm", harm)
+    _check_search(harm, optimizer)
+    starts, steps, key = check.whole("starts", starts), check.whole("steps", steps), one_key(key)
     check.finite("low", low)
     check.finite("high", high)
+    _bounds_of(_floats("low", low), low, high)
+    key = jax.random.wrap_key_data(jnp.asarray(key))
     bounds = bounded(low, high)
     flat, unravel = ravel_pytree(_floats("low", low))
     shares = jax.random.uniform(jax.random.fold_in(key, starts), (starts, flat.size), flat.dtype, 0.05, 0.95)
@@ -388,6 +426,10 @@ def gradient_check(cost: Callable, theta, key, *, step: float | None = None, for
 
     Raises TypeError if the cost is no scalar.
     """
+    check.function("cost", cost)
+    one_key(key)
+    if step is not None:
+        check.positive("step", check.number("step", step))
     flat, unravel = ravel_pytree(_floats("theta", theta))
     at = lambda flat, key: cost(unravel(flat), key)
     if flat.size <= FEW if forward is None else forward:  # one compilation, the directions one by one

@@ -17,6 +17,7 @@ import numpy as np
 from jaxatt import check, scores
 from jaxatt.attitude import quat_normalised, quat_rate, quat_rotate
 from jaxatt.bodies import ModuleInertia, cluster_inertia, cluster_momentum, cmg_motion
+from jaxatt.check import door
 from jaxatt.controllers import Steering, rate_pi, steer
 from jaxatt.engine import System, every
 from jaxatt.mounting import GimbalAxes, check_gimbal_axes, cmg_axes, cmg_triads
@@ -252,6 +253,7 @@ def score(params: Params, scenario: Scenario, now, log: Log) -> Scores:
     )
 
 
+@door
 def classify(run: Scores):
     """The class of a run (choice 2): `FLUCTUATION` of the gimbals, `LOCK` of the rate, or `PROPER`."""
     variation, ratio = np.asarray(run.variation), np.asarray(run.final) / np.asarray(run.start)
@@ -305,12 +307,14 @@ def _shaped(scenario: Scenario) -> Scenario:
     return Scenario(each, Failure(each, each, each, each), axes, known, each, each)
 
 
+@door
 def lost(skew, gamma, module: int = 3, onset=0.0, brake=1e-6, free=0.0, friction=0.0) -> Scenario:
     """The paper's spacecraft with four modules, one of which is lost.
 
     skew: 54.7 deg for the pyramid, 90 deg for box-90 [deg]; gamma: four gimbal angles [deg]; module: the lost one,
     0 to 3; onset [s], brake [N m s], free, friction [N m s]: of its failure, by default a wheel stop at once.
     """
+    check.one_of("module", module, (0, 1, 2, 3))
     this = np.arange(4) == module
     failure = Failure(*(np.where(this, a, b) for a, b in ((onset, np.inf), (brake, 0), (free, 0), (friction, 0))))
     return Scenario(np.radians(gamma), failure, cmg_axes(np.radians(skew), np.radians([0.0, 90.0, 180.0, 270.0])))

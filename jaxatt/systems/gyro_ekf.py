@@ -18,6 +18,7 @@ import numpy as np
 from jaxatt import check, scores
 from jaxatt.attitude import euler_body_rate, euler_rate
 from jaxatt.bodies import wheel_rate, wheeled_acceleration
+from jaxatt.check import door
 from jaxatt.controllers import allocation, pid
 from jaxatt.detection import chi_square, smoothed, worst_above
 from jaxatt.engine import System, every
@@ -162,6 +163,7 @@ class Log(NamedTuple):
 # the truth
 
 
+@door
 def failed(mask, onset: Any = 0.0) -> Fault:
     """Gyros or wheels that are dead from the onset [s] on where mask, (4, *lanes) of bool, is true."""
     mask = np.asarray(mask, bool)
@@ -410,6 +412,7 @@ class FilterScores(NamedTuple):
     parity: Any  # [s] first time the parity's chi-square was above the threshold; inf if never
 
 
+@door
 def worst(v):
     """Largest magnitude of v, three or four components."""
     return jnp.max(jnp.abs(jnp.stack(v)), axis=0)
@@ -444,6 +447,7 @@ def score(params: Params, scenario: Scenario, now, log: Log) -> FilterScores:
     )
 
 
+@door
 def consistent(params: Params) -> Params:
     """The filter with R = sigma^2, Q and P0 to match; Table 5 makes S 1e6 times too large (erratum 1)."""
     R = np.repeat([1e-4**2, 1e-6**2, 1e-4**2], [3, 4, 4])

@@ -16,6 +16,7 @@ from numpy import sqrt
 from jaxatt import check, scores
 from jaxatt.attitude import mrp_error, mrp_inner, mrp_nearest, mrp_rate
 from jaxatt.bodies import body_acceleration
+from jaxatt.check import door
 from jaxatt.controllers import adapted_rate_gain, pd, rate_gain_floor, saturated
 from jaxatt.engine import System
 from jaxatt.estimators import AttitudeRate, mrp_observer, residual_norm
@@ -233,6 +234,7 @@ class Margins(NamedTuple):
     T: Any  # [N m/s] of T_I > 0, eq. (16), for constant gains
 
 
+@door
 def margins(params: Params, lambda_max, e_q=0.0, e_w=0.0) -> Margins:
     """The margins at tracking errors of norms e_q [1] and e_w [rad/s], with k_w = k_w0.
 

@@ -22,6 +22,7 @@ import numpy as np
 from jaxatt import check, scores
 from jaxatt.attitude import quat_conjugate, quat_error, quat_normalised, quat_rate, quat_rotate
 from jaxatt.bodies import body_acceleration, gravity_gradient
+from jaxatt.check import door
 from jaxatt.controllers import quaternion_pd, saturated
 from jaxatt.detection import alarm, isolate
 from jaxatt.engine import System
@@ -56,15 +57,19 @@ def _turn(x, y, z) -> Quat:
     return Quat(float(np.cos(angle / 2)), *(float(a) for a in np.sin(angle / 2) * r / angle))
 
 
+@door
 def on_sensor(number: int, faults: Vec3) -> Vec3:
     """Faults per axis of one star sensor, number `ROLL` or `PITCH`, the other healthy: a `Vec3` of `Fault` (2,)."""
+    check.one_of("number", number, (ROLL, PITCH))
     healthy = on_axes(Fault())
     pair = (faults, healthy) if number == ROLL else (healthy, faults)
     return jax.tree.map(lambda a, b: np.stack(np.broadcast_arrays(a, b)), *pair)
 
 
+@door
 def tangential(number: int, fault: Fault) -> Vec3:
     """The same fault on the two axes of star sensor ``number`` across its boresight; along it a turn moves nothing."""
+    check.one_of("number", number, (ROLL, PITCH))
     return Vec3(Fault(), fault, fault) if number == ROLL else Vec3(fault, Fault(), fault)
 
 
@@ -213,12 +218,14 @@ class Generator(NamedTuple):
     linear: bool  # whether pointing must stay within LINEAR_RANGE
 
 
+@door
 def orbit_rate(rate) -> Vec3:
     """w_r = (0, -wo, 0): rate of the orbit frame in its own axes [rad/s]."""
     o = jnp.zeros_like(rate)
     return Vec3(o, -rate, o)
 
 
+@door
 def quaternion_error(x: Quat, P, q: Quat):
     """Turn [rad] by which the estimate x of q errs, its deviation, NEES of the vector part and of all four.
 
@@ -492,6 +499,7 @@ def refuse_bad(generator: Generator, params: Params, scenario: Scenario) -> tupl
     return lanes
 
 
+@door
 def system_of(generator: Generator = LMMSE, window: int = 1, dt: float = DT) -> System:
     """The loop with another filter (`WITH_BIAS`, `TURN`), a window of N values in eq. (18), or another sampling.
 

@@ -22,6 +22,7 @@ import numpy as np
 
 from jaxatt import check, scores
 from jaxatt.bodies import Wheel, wheel_acceleration
+from jaxatt.check import door
 from jaxatt.controllers import Adaptation, Mrac, mrac_flow, mrac_input, mrac_sampled_bound, mrac_step
 from jaxatt.engine import System
 from jaxatt.estimators import LeastSquares, least_squares
@@ -182,6 +183,7 @@ START_UP = 10.0  # [s] window reported apart: the parameters leave their start
 WINDOWS = ((0.0, 20.0), (20.0, 60.0), (60.0, jnp.inf))  # [s] of the paper's words on Fig. 10
 
 
+@door
 def slew(params: Params, t):
     """Desired attitude [deg] and rate [deg/s] at t [s]: a tanh from 0 to D in T, not quite from rest to rest."""
     s = jnp.tanh(5 * (t - params.duration / 2) / params.duration)
@@ -389,6 +391,7 @@ def score(params: Params, scenario: Scenario, now, log: Log) -> Scores:
     )
 
 
+@door
 def normals_of(v, amplitude):
     """The noise array, shape (ticks, 3, *lanes), with which `simulate` adds the attitude noise v to the readings.
 
@@ -476,6 +479,7 @@ def _warn_of_fast_adaptation(sampled: bool, dt: float, substeps: int, params: Pa
         )
 
 
+@door
 def loop(*, sampled: bool = False, dt: float = DT, substeps: int = 20) -> System:
     """The closed loop with continuous or sampled adaptation, ticks of dt [s] and RK4 steps of dt / substeps.
 

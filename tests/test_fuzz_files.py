@@ -1,0 +1,273 @@
+"""Abuse of files and campaigns: a broken, foreign or hostile file gives one line, and none of them runs code."""
+
+import json
+import pickle
+import shutil
+import sys
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import jax
+import numpy as np
+import optax
+import pandas
+import pytest
+from abuse import JUNK, fuzzed, judged, junk, nearly, plain, whole
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jaxatt import replay
+from jaxatt.campaign import dataset, extend, run, scenarios, until
+from jaxatt.campaign import replay as rerun
+from jaxatt.tuning import tune
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from benchmarks.tiny_campaign import campaign, files, record
+
+exploded = []
+
+
+def explode():
+    exploded.append(1)
+
+
+class Bomb:
+    def __reduce__(self):
+        return explode, ()
+
+
+PICKLE = pickle.dumps(Bomb())
+pickle.loads(PICKLE)
+assert exploded == [1], "a pickle runs code, if it is read as one"
+exploded.clear()
+
+
+@st.composite
+def spoiled(draw, data):
+    """Bytes of which some are others, or none at all."""
+    for _ in range(draw(st.integers(0, 2))):
+        at = draw(st.integers(0, len(data)))
+        data = draw(st.sampled_from([
+            data[:at], data[at:], b"", PICKLE, data[:at] + PICKLE + data[at:], data + data, data[:at] + b"\xff" + data[at + 1 :],
+            data[:at] + draw(st.binary(max_size=9)) + data[at + 4 :], data.replace(b"1", b"9"), data.replace(b"[", b"{"), bytes(99),
+        ]))  # fmt: skip
+    return data
+
+
+def answered(f, names, *args, **how):
+    said = judged(f, names, *args, also=(RuntimeError, FileNotFoundError), **how)
+    assert not exploded, "code of a file was run"
+    return said
+
+
+# recorded readings
+
+
+TABLE = pandas.DataFrame({"time [s]": np.arange(6.0), "gyro [rad/s]": np.arange(6) / 3, "note": list("abcdef")})
+CSV = TABLE.to_csv(index=False).encode()
+PARQUET = TABLE.to_parquet()
+
+
+@fuzzed
+@given(
+    data=st.one_of(spoiled(CSV), spoiled(PARQUET)),
+    name=st.sampled_from(["a.csv", "a.parquet", "a.csv", "a.parquet", "a.txt", "a.csv.gz", "a"]),
+    units=st.sampled_from(
+        [{"gyro": "rad/s"}] * 4 + [{}, {"gyro": "deg/s"}, {"star": "1"}, {3: 3}, None, "gyro", {"note": None}]
+    ),
+    time=st.sampled_from(["time"] * 4 + ["gyro", "note", "", 3, None]),
+)
+def test_recorded_files(data, name, units, time):
+    with TemporaryDirectory() as folder:
+        path = Path(folder, name)
+        path.write_bytes(data)
+        words = {"path", "units", "time", "gyro", "star", "note", "rad", "s", *map(str, units or ()), str(time)}
+        answered(lambda: replay.load(path, units, time=time), words)
+
+
+def test_what_is_no_path():
+    for bad in [b for b in JUNK if not isinstance(b, str)]:
+        assert judged(replay.load, {"path"}, bad, {})
+        for f in (dataset, lambda path: run(path, campaign(), 128), lambda path: rerun(path, campaign(), 0)):
+            assert judged(f, {"path"}, bad)
+
+
+# saved searches
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory):
+    path = tmp_path_factory.mktemp("search") / "tune.npz"
+    search(path)
+    return path.read_bytes()
+
+
+def search(path, theta=0.5, steps=3):
+    return tune(parabola, theta, optax.sgd(0.1), steps, jax.random.key(0), save=path, progress=False)
+
+
+def parabola(theta, key):
+    return (theta - 2) ** 2
+
+
+def forged(saved, changes):
+    """A saved search with some of its arrays others."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder, "a.npz")
+        path.write_bytes(saved)
+        held = dict(np.load(path))
+        for name, value in changes.items():
+            held[list(held)[name % len(held)]] = value
+        np.savez(path, **held)
+        return path.read_bytes()
+
+
+values = st.sampled_from(
+    [np.zeros(3), np.array("a"), np.array([Bomb()]), np.zeros((0,)), np.float32(1.0), np.array(1 + 1j), None]
+)
+
+
+def test_saved_searches(saved):
+    @fuzzed
+    @given(data=st.one_of(spoiled(saved), st.dictionaries(st.integers(0, 20), values, max_size=2)))
+    def check(data):
+        with TemporaryDirectory() as folder:
+            path = Path(folder, "tune.npz")
+            path.write_bytes(forged(saved, data) if isinstance(data, dict) else data)
+            answered(lambda: search(path), {"save", "steps"})
+
+    check()
+
+
+# campaigns: what is asked
+
+
+key = jax.random.key(3)
+TINY = campaign()
+functions = st.sampled_from([None, 3, "a", lambda *a: {}, lambda *a: np.zeros(2)])  # their own errors are the user's
+rarely = st.sampled_from([0, -1, 2.5, "a", None, 2**31, True, np.nan, np.int64(9)])
+FIELDS = dict(
+    system=st.sampled_from([None, 3, TINY, TINY.system._replace(dt=0.2), TINY.system._replace(check=None)]),
+    params=st.sampled_from([TINY.params._replace(gain=a) for a in ("a", -1.0, np.nan, np.zeros(2), np.float16(1), 1j, None)]),
+    sample=st.sampled_from([None, 3, "a"]), key=plain(), ticks=rarely, score=functions,
+    inputs=functions, record=functions, every=rarely, block=st.one_of(whole, st.just(256)), size=whole,
+    units=st.sampled_from([{}, {"rms": 3}, {"colour": "m"}, None, "m", 3]),
+)  # fmt: skip
+ASKED = dict(
+    n=st.one_of(st.sampled_from([128, 100, 129]), st.sampled_from([0, -1, 2**31, "a", None, 1.5])),
+    shard=st.one_of(st.sampled_from([(0, 1), (0, 2), (1, 2), (2, 2), (0,), (0, 0), (-1, 1)]), junk),
+    accept=st.sampled_from([(), ["jax"], "jax", 3, None, [3]]), executor=st.sampled_from([None, None, 3, "a"]),
+    index=whole, looks=st.sampled_from([[100, 128], [], [128, 100], 3, ["a"], None]), half_width=plain(), level=plain(),
+    success=st.sampled_from([lambda found: found.ok, None, 3]), start=whole, stop=st.one_of(st.just(128), whole),
+    **{f"campaign.{name}": values for name, values in FIELDS.items()}, campaign=junk,
+)  # fmt: skip
+FITTING = dict(n=128, shard=(0, 1), accept=(), executor=None, index=0, looks=[100, 128], half_width=0.3, level=0.95, campaign=TINY,
+               success=lambda found: found.ok, start=0, stop=128)  # fmt: skip
+FITTING |= {f"campaign.{name}": getattr(TINY, name) for name in FIELDS}
+WORDS = {"campaign", "path", "key", "params", "score", "input", "record", "scenario", "scenarios", *ASKED, *FIELDS}
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory):
+    """The files of a store of two blocks, with records."""
+    path = tmp_path_factory.mktemp("store") / "x.zarr"
+    run(path, campaign(record=record, every=10), 200, progress=False)
+    return files(path)
+
+
+@fuzzed
+@given(nearly(FITTING, ASKED))
+def test_campaigns(asked):
+    fields = {name.split(".")[1]: value for name, value in asked.items() if "." in name}
+    given_ = TINY._replace(**fields) if asked["campaign"] is TINY else asked["campaign"]
+    how = {name: asked[name] for name in ("shard", "accept", "executor")} | {"progress": False}
+    with TemporaryDirectory() as folder:
+        path = Path(folder, "x.zarr")
+        said = judged(scenarios, WORDS, given_, asked["start"], asked["stop"])
+        said = judged(run, WORDS, path, given_, asked["n"], **how)
+        if said:
+            assert not path.exists() or dataset(path).sizes["scenario"] == 0, "refused, but something was computed"
+        else:
+            judged(rerun, WORDS, path, given_, asked["index"])
+            judged(
+                until,
+                WORDS,
+                path,
+                given_,
+                asked["looks"],
+                asked["success"],
+                asked["half_width"],
+                level=asked["level"],
+                **how,
+            )
+
+
+# campaigns: what lies on the disk
+
+
+@st.composite
+def other_json(draw, text):
+    """Metadata with one value another."""
+    tree = json.loads(text)
+    node = tree
+    while True:
+        place = draw(st.sampled_from(list(node) if isinstance(node, dict) else range(len(node))))
+        if not (isinstance(node[place], (dict, list)) and node[place] and draw(st.integers(0, 3))):
+            break
+        node = node[place]
+    node[place] = draw(
+        st.sampled_from([None, -1, 0, 7, 10**12, "a", [], {}, [10**12], [1], True, 1e300, "float64", {"name": "a"}])
+    )
+    if draw(st.integers(0, 4)) == 0:
+        del node[place]
+    return json.dumps(tree).encode()
+
+
+@st.composite
+def spoiled_store(draw, files):
+    """A store with up to two of its files other, gone, or beside a store of the old format whose chunks are pickles."""
+    files = dict(files)
+    for _ in range(draw(st.integers(0, 2))):
+        name = draw(st.sampled_from(sorted(files)))
+        if name.endswith("zarr.json") and draw(st.booleans()):
+            files[name] = draw(other_json(files[name]))
+        elif draw(st.integers(0, 3)):
+            files[name] = draw(spoiled(files[name]))
+        else:
+            del files[name]
+        if not files:
+            break
+    if draw(st.integers(0, 9)) == 0:
+        array = dict(zarr_format=2, shape=[200], chunks=[200], dtype="|O", compressor=None, fill_value=None, order="C",
+                     filters=[{"id": "pickle"}])  # fmt: skip
+        files.pop("rms/zarr.json", None)
+        files |= {"rms/.zarray": json.dumps(array).encode(), "rms/0": PICKLE, ".zgroup": b'{"zarr_format": 2}'}
+    return files
+
+
+def test_spoiled_stores(store):
+    whole_one = campaign(record=record, every=10)
+
+    @fuzzed
+    @given(spoiled_store(store))
+    def check(spoiled):
+        with TemporaryDirectory() as folder:
+            path = Path(folder, "x.zarr")
+            for name, data in spoiled.items():
+                (path / name).parent.mkdir(parents=True, exist_ok=True)
+                (path / name).write_bytes(data)
+            said = answered(lambda: dataset(path).load() and None, {"path"})
+            repaired = answered(lambda: run(path, whole_one, 200, progress=False) and None, {"path", "campaign", "n"})
+            if not repaired:
+                assert {k: v for k, v in files(path).items() if k in store} == store or said is not None
+
+    check()
+
+
+def test_a_store_that_grows_where_there_is_none():
+    with (
+        TemporaryDirectory() as folder,
+        pytest.raises(FileNotFoundError, match="`path` must be the store of a campaign"),
+    ):
+        extend(Path(folder, "x.zarr"), TINY, 128)
+    shutil.rmtree(folder, ignore_errors=True)
