@@ -244,7 +244,8 @@ def resample(t, columns: Mapping[str, Any], *, dt: float, ticks: int | None = No
             "time", f"span at most {SPARSE} ticks of {dt:g} s for each sample", f"{len(t)} samples in {span:.3g} ticks"
         )
     n = round(span) + 1 if ticks is None else check.whole("ticks", ticks)
-    check.fits_memory(f"`ticks` = {n} of {len(columns)} channels", 10 * n * len(columns), "ask for fewer")
+    takes = n * (40 + 10 * len(columns))  # bytes on the way, and those of the readings
+    check.fits_memory(f"`ticks` = {n} of {len(columns)} channels", takes, "ask for fewer")
     out = {}
     for name, a in columns.items():
         known = np.isfinite(a)
