@@ -211,6 +211,15 @@ def test_clearance_of_zero_momentum():
     assert sg.clearance(FOUR["box"], np.zeros(3)) == pytest.approx(0, abs=1e-6)
 
 
+def test_far_outside_the_nearest_singular_momentum_is_the_envelopes():
+    """The flat discs of the rims end where the envelope ends."""
+    box = FOUR["box"]
+    for far in np.eye(3):
+        reached = float(sg.support(box, Vec3(*far[:, None]))[0])
+        near = sg.clearance(box, 100 * far)
+        assert 100 - reached - 1e-6 <= near <= np.hypot(100 - reached, 4)
+
+
 REACH = {
     "pyramid": ((2.15572, 2.30991, 2.37880), (3.1557, 3.1557, 3.2646)),
     "box": ((1, 3**0.5, 3), (2, 2, 4)),

@@ -278,7 +278,42 @@ def test_seven_states_without_a_bias_are_the_four(run):
     np.testing.assert_allclose(rows(seven.r), rows(four.r), atol=1e-3 * params.std_star)
 
 
+def test_a_known_bias_is_taken_off_the_gyros_reading():
+    x, b, w, w_r = Quat(0.9, 0.1, -0.3, 0.2), Vec3(1e-3, -2e-3, 3e-3), Vec3(0.01, 0.02, -0.03), Vec3(0.0, -1e-3, 0.0)
+    P = np.random.default_rng(1).normal(size=(7, 7)) * 1e-3
+    P = P @ P.T
+    noise = 1e-3, 1e-5, DT
+    believed = lambda b: lmmse.Estimate(lmmse.AttitudeBias(*x, *b), tuple(map(tuple, P)))
+    a, c = (lmmse.bias_predict(believed(b_), rate, w_r, *noise) for b_, rate in ((b, w), (Vec3(0.0, 0.0, 0.0), w - b)))
+    np.testing.assert_allclose(a.x[:4], c.x[:4], rtol=1e-13)
+    np.testing.assert_allclose(a.P, c.P, rtol=1e-12, atol=1e-18)
+
+
+def test_the_nees_is_that_of_plain_matrices():
+    rng = np.random.default_rng(2)
+    P, x, q = rng.normal(size=(4, 4)) * 1e-3, rng.normal(size=4), rng.normal(size=4)
+    P, e = P @ P.T, x - q
+    turn, std, nees, nees_q = star.quaternion_error(Quat(*x), tuple(map(tuple, P)), Quat(*q))
+    np.testing.assert_allclose(turn, 2 * e[1:])
+    np.testing.assert_allclose(std, 2 * np.sqrt(np.diag(P)[1:]))
+    np.testing.assert_allclose(nees, e[1:] @ np.linalg.solve(P[1:, 1:], e[1:]), rtol=1e-9)
+    np.testing.assert_allclose(nees_q, e @ np.linalg.solve(P, e), rtol=1e-9)
+
+
 # structure
+
+
+def test_every_reading_has_noise_of_its_own():
+    s = healthy._replace(std_gyro=1e-3, std_star=1e-3, walk=1e-3)
+    x, z = star.init(star.LMMSE, 1, params, s)
+    read = lambda noise: star.sense(params, s, jaxatt.Now(0, 0.0, DT), x, z, jnp.asarray(noise))
+    loud, quiet = read(np.arange(1.0, 13.0)), read(np.zeros(12))
+    off = jax.tree.map(lambda a, b: np.asarray(a - b), loud, quiet)
+    np.testing.assert_allclose(rows(off.readings.gyro), [1e-3, 2e-3, 3e-3], rtol=1e-9)
+    np.testing.assert_allclose(rows(off.bias), 1e-3 * DT**0.5 * np.array([4.0, 5.0, 6.0]), rtol=1e-9)
+    np.testing.assert_allclose(
+        rows(off.readings.stars), 1e-3 * np.array([[7.0, 9.0, 11.0], [8.0, 10.0, 12.0]]), rtol=1e-9
+    )
 
 
 @pytest.mark.slow
