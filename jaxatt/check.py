@@ -207,7 +207,10 @@ def float_type(trees):
 
 
 def precise(said: str, trees) -> None:
-    """Warn of a run in float32, in which what ``said`` says goes wrong; Python shows it once per line of the caller."""
+    """Warn of a run in float32, in which what ``said`` says goes wrong; Python shows it once per line of the caller.
+
+    trees: the params and the scenario of the run.
+    """
     if float_type(trees) == np.float32:
         way_out = "Run in float64: jax.config.update('jax_enable_x64', True)."
         warnings.warn(f"{said}. {way_out}", stacklevel=5)  # of simulate and sweep
