@@ -114,7 +114,7 @@ COUNTS = {72: (9168, 22720), 120: (40976, 77312), 180: (137152, 229744), 360: (1
 COUNTS[720] = (8808256, 16346560)
 
 
-@pytest.mark.parametrize("points", COUNTS)
+@pytest.mark.parametrize("points", [*list(COUNTS)[:-1], pytest.param(720, marks=pytest.mark.slow)])
 def test_table_3(points):
     got = [sg.ill_conditioned(THREE[name], points) for name in SKEWS]
     assert got == [(count, points**3) for count in COUNTS[points]]

@@ -328,6 +328,12 @@ def test_uniform_noise():
     np.testing.assert_allclose([log.a_r[-1, 0], log.a_y[-1, 0]], [0.670, -0.169], atol=1e-3)
 
 
+def test_the_estimate_from_rates_finds_the_inertia():
+    differenced = wm.params._replace(differenced=1.0)
+    log = jaxatt.simulate(wm.loop(substeps=5), differenced, QUIET, SILENCE[:1000], ticks=1000)
+    assert log.J_hat[0] == pytest.approx(5.0) and log.J_hat[-1] == pytest.approx(QUIET.J_z, rel=1e-3)
+
+
 def test_scores_are_those_of_the_log():
     scenarios = batch(wm.scenario, 2)
     system = wm.loop(substeps=5)
