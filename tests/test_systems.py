@@ -20,14 +20,6 @@ TICKS = 30
 pytestmark = pytest.mark.parametrize("name", NAMES)
 
 
-@pytest.fixture(autouse=True)
-def quick_compile():
-    """These tests compile much, run little and hold for any program."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
-
-
 @pytest.fixture
 def loop(name):
     return importlib.import_module(f"jaxatt.systems.{name}")
