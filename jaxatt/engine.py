@@ -420,7 +420,13 @@ def vmapped(system: System) -> System:
     def flow(params, scenario, t, x, z):
         return over(lambda scenario, x, z: system.flow(params, scenario, t, x, z), z.lanes, scenario, x, z.z)
 
-    return system._replace(init=init, tick=tick, flow=flow)
+    def refuse(params, scenario):
+        lanes = system.check(params, scenario)
+        if lanes:  # params have none of their own: they fit every scenario alone
+            system.check(params, jax.tree.map(lambda a: a[(..., *[0] * len(lanes))], scenario))
+        return lanes
+
+    return system._replace(init=init, tick=tick, flow=flow, check=refuse)
 
 
 # compilation

@@ -50,9 +50,11 @@ def value_and_gradient(cost: Callable, theta, key, *, forward: bool | None = Non
 
 
 def _scalar(cost: Callable, theta, key) -> None:
-    shape = jax.eval_shape(cost, theta, key).shape
-    if shape != ():
-        raise TypeError(f"`cost` must be a scalar, but its shape is {shape}.")
+    value = jax.eval_shape(cost, theta, key)
+    if not hasattr(value, "shape"):
+        raise TypeError(f"`cost` must be a scalar, but it is {check.short(value)}.")
+    if value.shape != ():
+        raise TypeError(f"`cost` must be a scalar, but its shape is {value.shape}.")
 
 
 # the search
@@ -152,7 +154,12 @@ def _check_search(cost, optimizer) -> None:
 def _floats(name: str, theta):
     if not jax.tree.leaves(check.numbers(name, theta)):
         raise TypeError(f"`{name}` must hold at least one number, but it is {check.short(theta)}.")
-    return jax.tree.map(lambda a: jnp.asarray(a, jnp.result_type(a, float)), theta)
+
+    def convert(a):  # by NumPy where it will do: it compiles nothing
+        kind = jnp.result_type(a, float)
+        return jnp.asarray(a if isinstance(a, jax.Array) else np.asarray(a, kind), kind)
+
+    return jax.tree.map(convert, theta)
 
 
 def _start(optimizer, theta) -> _Search:
