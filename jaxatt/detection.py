@@ -70,7 +70,12 @@ def threshold_quantile(false_alarm, dof):
     """
     check.between("false_alarm", false_alarm, 0, 1, "a probability")
     check.positive("dof", dof)
-    target, dof = jnp.broadcast_arrays(jnp.asarray(false_alarm, float), jnp.asarray(dof, float))
+    return _exceeded(jnp.asarray(false_alarm, float), jnp.asarray(dof, float))
+
+
+@jax.jit
+def _exceeded(target, dof):
+    target, dof = jnp.broadcast_arrays(target, dof)
     high = dof + 40 * jnp.sqrt(2 * dof) + 1500  # survival below 1e-300
 
     def halve(_, interval):
