@@ -422,7 +422,7 @@ def vmapped(system: System) -> System:
 
     def refuse(params, scenario):
         lanes = system.check(params, scenario)
-        if lanes:  # params have none of their own: they fit every scenario alone
+        if lanes and 0 not in lanes:  # params have none of their own: they fit every scenario alone
             system.check(params, jax.tree.map(lambda a: a[(..., *[0] * len(lanes))], scenario))
         return lanes
 
