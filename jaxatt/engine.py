@@ -331,6 +331,12 @@ def admit(system: System, params, scenario, lanes: tuple | None = None):
     return params, scenario
 
 
+def fit_alone(system: System, params, scenario, lanes: tuple) -> None:
+    """Refuse, by the system's check, params that do not fit the first scenario alone: such have lanes of their own."""
+    if 0 not in lanes:
+        system.check(params, jax.tree.map(lambda a: a[(..., *[0] * len(lanes))], scenario))
+
+
 def block_scores(system: System, score: Callable, ticks: int, params, scenarios, key, block):
     """Scores of one block of `BLOCK` scenarios: a tree of values of shape (..., BLOCK). Pure.
 
@@ -422,8 +428,8 @@ def vmapped(system: System) -> System:
 
     def refuse(params, scenario):
         lanes = system.check(params, scenario)
-        if lanes and 0 not in lanes:  # params have none of their own: they fit every scenario alone
-            system.check(params, jax.tree.map(lambda a: a[(..., *[0] * len(lanes))], scenario))
+        if lanes:
+            fit_alone(system, params, scenario, lanes)
         return lanes
 
     return system._replace(init=init, tick=tick, flow=flow, check=refuse)

@@ -14,7 +14,18 @@ import numpy as np
 from tqdm import tqdm
 
 from jaxatt import check
-from jaxatt.engine import BLOCK, System, admit, block_log, block_scores, compiled, one_key, traced, tree_bytes
+from jaxatt.engine import (
+    BLOCK,
+    System,
+    admit,
+    block_log,
+    block_scores,
+    compiled,
+    fit_alone,
+    one_key,
+    traced,
+    tree_bytes,
+)
 
 
 def sweep(system: System, params, scenarios, key, *, ticks: int, score: Callable, progress: bool | None = None):
@@ -45,7 +56,7 @@ def _admitted(system, params, scenarios, n):
     """`admit` for n scenarios of which each must fit the params alone: params with lanes are `varied`'s."""
     params, scenarios = admit(system, params, scenarios, (n,))
     if any(np.shape(leaf)[-1:] == (n,) for leaf in jax.tree.leaves(params)):
-        admit(system, params, jax.tree.map(lambda leaf: leaf[..., 0], scenarios), ())
+        fit_alone(system, params, scenarios, (n,))
     return params, scenarios
 
 
