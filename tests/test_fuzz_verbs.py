@@ -231,7 +231,7 @@ def datasets(draw):
         variables[name] = draw(st.sampled_from([
             (dims, values.astype(str), attributes), (dims, values * np.nan, attributes), (dims, values, {}), ((), 3.0, attributes),
             (dims, values.astype(object), attributes), (dims, values + 1j, attributes), ("other", np.arange(5.0), attributes),
-            (dims, values.astype("datetime64[s]"), attributes), (dims, values, {"role": "score", "units": 3}),
+            (dims, np.zeros(np.shape(values), "datetime64[s]"), attributes), (dims, values, {"role": "score", "units": 3}),
         ]))  # fmt: skip
     for name in draw(st.lists(st.sampled_from(list(variables)), max_size=1)):
         del variables[name]
