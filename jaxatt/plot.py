@@ -10,6 +10,7 @@ Nothing in the package imports this module.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import wraps
 from typing import Any
 
 import jax
@@ -21,7 +22,7 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from jaxatt import check, detection
 from jaxatt import singularity as sg
-from jaxatt.check import door
+from jaxatt.check import F, door
 from jaxatt.faults import Fault
 from jaxatt.mounting import GimbalAxes
 from jaxatt.vec import Vec3, array
@@ -76,6 +77,22 @@ def _new(ax, **how) -> Any:
     return plt.subplots(layout="constrained", **how)[1] if ax is None else ax
 
 
+def _figure(f: F) -> F:
+    """The door of what draws: a refusal closes the figure it had begun, which a notebook would show empty."""
+
+    @wraps(f)
+    def draw(*args, **kwargs):
+        before = set(plt.get_fignums())
+        try:
+            return f(*args, **kwargs)
+        except Exception:
+            for number in set(plt.get_fignums()) - before:
+                plt.close(number)
+            raise
+
+    return door(draw)  # pyright: ignore[reportReturnType]
+
+
 # one run
 
 
@@ -96,7 +113,7 @@ def fault_times(scenario) -> dict[str, float]:
     return {" and ".join(names) + " fault": onset for onset, names in sorted(found.items())}
 
 
-@door
+@_figure
 def overview(
     t,
     panels: Mapping[str, Any],
@@ -149,7 +166,7 @@ def overview(
 # many runs
 
 
-@door
+@_figure
 def heat_map(
     data,
     x: str,
@@ -200,7 +217,7 @@ def heat_map(
     return ax
 
 
-@door
+@_figure
 def sweep_summary(
     data, names: Sequence[str] | None = None, *, labels: Mapping[str, str] | None = None, axes: Any = None
 ) -> np.ndarray:
@@ -239,7 +256,7 @@ def sweep_summary(
 # detectors and designs
 
 
-@door
+@_figure
 def roc(curves: Mapping[str, detection.Roc], *, samples: int = 1, least: float = 1e-6, ax: Any = None) -> Axes:
     """Detection over false alarms for each `detection.Roc`, beside what luck gives.
 
@@ -269,7 +286,7 @@ def front(costs) -> np.ndarray:
     return ~np.array(beaten, bool) & np.isfinite(a).all(axis=1)
 
 
-@door
+@_figure
 def pareto(
     data,
     x: str,
@@ -299,7 +316,7 @@ def pareto(
     return ax
 
 
-@door
+@_figure
 def subsets(
     out, values: Mapping[str, Any], *, names: str = "ABCD", what: str = "dead gyros", axes: Any = None
 ) -> np.ndarray:
@@ -347,7 +364,7 @@ def subsets(
 # momentum
 
 
-@door
+@_figure
 def singular_surface(gimbals: GimbalAxes, reversed: int = 0, ax: Any = None, *, fine: int = 80) -> Axes:
     """The singular momenta of a cluster with so many modules reversed, 0 for the envelope, and the rims of its holes.
 

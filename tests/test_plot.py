@@ -179,6 +179,8 @@ def test_the_surface_reaches_as_far_as_the_cluster(reversed, monkeypatch):
     ],
 )  # fmt: skip
 def test_bad_input_is_refused_in_one_line(draw, message):
+    before = plt.get_fignums()
     with pytest.raises(ValueError, match=message) as refusal:
         draw()
     assert "\n" not in str(refusal.value)
+    assert plt.get_fignums() == before, "an empty figure is left open"
