@@ -40,7 +40,9 @@ def test_the_quantile_is_that_of_scipy():
     np.testing.assert_allclose(detection.threshold_quantile(p, dof), stats.chi2.isf(p, dof), rtol=1e-9)
 
 
-@pytest.mark.parametrize("p, dof, word", [(0.0, 3, "false_alarm"), (1.0, 3, "false_alarm"), (0.1, -1, "dof"), (0.1, 1e30, "dof")])
+@pytest.mark.parametrize(
+    "p, dof, word", [(0.0, 3, "false_alarm"), (1.0, 3, "false_alarm"), (0.1, -1, "dof"), (0.1, 1e30, "dof")]
+)
 def test_a_quantile_of_nothing_is_refused(p, dof, word):
     with pytest.raises(ValueError, match=f"`{word}` must"):
         detection.threshold_quantile(p, dof)
