@@ -4,6 +4,8 @@ An attitude is the rotation of the body frame against a reference frame. Every m
 components to reference components unless its name says otherwise. MRP: q = tan(angle/4) axis, with the
 shadow set -q/|q|^2 for the same attitude. Quaternions: scalar first, Hamilton product, so that the matrix of
 p * q is the product of the matrices. Shapes: components lead, lanes trail.
+
+May import: check, vec.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Plants: how spacecraft really move."""
+"""Plants: how spacecraft really move.
+
+May import: check, vec, attitude, faults, mounting, scores.
+"""
 
 from __future__ import annotations
 

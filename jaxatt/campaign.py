@@ -4,6 +4,8 @@ A campaign is a pure function of the index of a scenario, so it matters neither 
 The store is a Zarr group: one array for every score, the scenarios in its last axis, in chunks of one block. A
 block counts as done when the last chunk written of it, its checksum in ``done``, fits what is there; everything
 else is computed again. A store holds numbers and names, no code: opening one runs nothing.
+
+May import: check, engine, study, store, summary.
 """
 
 from __future__ import annotations

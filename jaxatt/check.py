@@ -3,7 +3,9 @@
 One grammar for every refusal: "`name` must be such, but it is value." Checks read concrete numbers; under a
 transformation (jit, grad, vmap) there are none and they pass. Lanes trail: the message names the first
 offending lane. name: what the message calls the argument; value: what was handed in; must and reason: words of the
-message. Imports nothing of jaxatt.
+message.
+
+May import: nothing of ours.
 """
 
 from __future__ import annotations

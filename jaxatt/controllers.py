@@ -1,4 +1,7 @@
-"""Control laws: from what on-board code believes to a torque."""
+"""Control laws: from what on-board code believes to a torque.
+
+May import: check, vec, attitude, faults, mounting, scores, singularity.
+"""
 
 from __future__ import annotations
 

@@ -4,6 +4,8 @@ All are pure functions of the index, so that a campaign can compute any block an
 Points lie strictly inside (0, 1), ready for an inverse distribution function. Whether a design may be extended:
 iid and Sobol points do not know how many there will be, so it may; a Latin hypercube and a full factorial are
 balanced only as a whole, and have a ``size``.
+
+May import: check.
 """
 
 from __future__ import annotations

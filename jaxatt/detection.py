@@ -3,6 +3,8 @@
 Time leads, lanes trail. An evaluation is any number that is large when something is wrong; here mostly
 J = r' M^-1 r, chi-square with as many degrees of freedom as the residual has where the filter is consistent. Values
 of it in healthy and in faulty runs are called healthy and faulty.
+
+May import: check, vec, attitude, faults, mounting, scores.
 """
 
 from __future__ import annotations

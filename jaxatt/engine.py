@@ -1,7 +1,9 @@
-"""The loop: what a closed loop is, how one is run. Knows no spacecraft; imports only check, scores and vec.
+"""The loop: what a closed loop is, how one is run. Knows no spacecraft.
 
 Time runs in ticks of ``dt``. A tick happens at its instant: sensors read, on-board code decides, a log is
 written. Between ticks the continuous state flows, by RK4. Scenarios lie in lanes, the last axis of everything.
+
+May import: check, vec, scores.
 """
 
 from __future__ import annotations

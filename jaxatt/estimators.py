@@ -1,4 +1,7 @@
-"""Estimators that keep no covariance: nonlinear observer, recursive least squares. Kalman filters: `kalman`."""
+"""Estimators that keep no covariance: nonlinear observer, recursive least squares. Kalman filters: `kalman`.
+
+May import: check, vec, attitude, faults, mounting, scores.
+"""
 
 from __future__ import annotations
 

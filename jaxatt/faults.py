@@ -3,6 +3,8 @@
 A `Fault` is numbers in the scenario, so every kind, size and onset is a batch axis and nothing recompiles.
 A faulty channel stays affine in the truth, reading = gain * truth + offset (`Channel`), which serves sampled
 sensors and those read continuously between ticks alike.
+
+May import: check, vec.
 """
 
 from __future__ import annotations

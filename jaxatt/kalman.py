@@ -2,6 +2,8 @@
 
 Components lead, lanes trail, and every loop over them is rolled: unrolled or reduced covariances are slow. Filters
 of few states are written as plain rows in `lmmse`.
+
+May import: check, vec, attitude, faults, mounting, scores.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Linear analysis of closed loops: the sampled loop's matrix, its growth rates, observability. Never in a scan."""
+"""Linear analysis of closed loops: the sampled loop's matrix, its growth rates, observability. Never in a scan.
+
+May import: check, vec, engine.
+"""
 
 from __future__ import annotations
 

@@ -3,6 +3,8 @@ and the multiplicative EKF they are held against. Yuan, He, Xing & Xiong.
 
 A state is a flat tuple of components (`Quat`, `AttitudeBias`, `Vec3`); a matrix is a tuple of rows. A linear map is a
 function on the state, which serves the estimate and the rows of its covariance alike.
+
+May import: check, vec, attitude, faults, mounting, scores.
 """
 
 from __future__ import annotations

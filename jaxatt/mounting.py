@@ -1,4 +1,7 @@
-"""Where things point on the spacecraft: axes and triads in body components."""
+"""Where things point on the spacecraft: axes and triads in body components.
+
+May import: check, vec.
+"""
 
 from __future__ import annotations
 

@@ -3,6 +3,8 @@
 Tracking and effort need none of this: ``scores.rms(log.e_q @ log.e_q, inside)`` and the like are smooth already.
 What is not smooth, alarms above all, has a surrogate here whose limit for temperature -> 0 is the real thing: tune
 on the surrogate, judge by the real thing.
+
+May import: check, vec, attitude, faults, mounting, scores.
 """
 
 from __future__ import annotations

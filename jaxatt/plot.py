@@ -5,6 +5,9 @@ Data is what the other modules give: logs and scores (NamedTuples), dicts of arr
 "delay [s]", "[1]" for a pure number; a dataset's ``units`` attribute does as well, and so does ``labels``.
 Colours are Okabe and Ito's, with a contrast of 3 or more on white and on black; text follows matplotlib's style.
 Nothing in the package imports this module.
+
+May import: check, vec, attitude, faults, mounting, scores, bodies, sensors, estimators, kalman, lmmse, controllers,
+detection, singularity.
 """
 
 from __future__ import annotations

@@ -9,6 +9,8 @@ closed loop gives the functions and where the board starts::
 Of a board the scenario decides the start alone: initial estimates and the like. Where an observer or an adaptive law
 moves between ticks (`observer_pd`, `wheel_mrac`), ``flow=loop.board_flow`` and the system's ``substeps`` go along.
 `load` reads a CSV or Parquet file, which never executes code, and `resample` brings its samples to the ticks.
+
+May import: check, vec, faults, engine.
 """
 
 from __future__ import annotations

@@ -4,6 +4,8 @@ A score is one pure function (params, scenario, now, log) -> tree of tallies. Th
 sum of those of its ticks, and `values` turns the sum into numbers. The defaults of a tally's fields are those
 of an empty run. A NaN in the log stays visible: means, extremes and final values become NaN, `always` False. value,
 condition: numbers of the tick, shape (*lanes); inside: bool, whether the tick lies in the window.
+
+May import: check, vec.
 """
 
 from __future__ import annotations

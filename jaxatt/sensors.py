@@ -1,4 +1,7 @@
-"""Sensor triads: how star sensors and gyros read, faults included."""
+"""Sensor triads: how star sensors and gyros read, faults included.
+
+May import: check, vec, attitude, faults, mounting, scores.
+"""
 
 from __future__ import annotations
 

@@ -4,6 +4,8 @@ T = [t_1 ... t_n] holds the torque directions (`mounting.Triads.t`); the cluster
 Everything about T is closed-form 3 x n algebra on `Vec3` of shape (n, *lanes): no decomposition, any lanes. A
 module that does not count has its column set to zero. Momenta are in units of one module's h_w, angles in rad.
 Source: Jin & Leeghim (2021), section 3; docs/loops/cmg_loss.md.
+
+May import: check, vec, attitude, faults, mounting, scores.
 """
 
 from __future__ import annotations

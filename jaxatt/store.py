@@ -2,6 +2,8 @@
 
 Every chunk is written whole and carries a checksum; the chunk of a block in ``done``, written last, holds that of
 all its numbers. A block whose numbers do not fit it is not done. Knows no campaign but its manifest.
+
+May import: nothing of ours.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Studies: what one does with a closed loop, in memory: sweep many scenarios, rerun one."""
+"""Studies: what one does with a closed loop, in memory: sweep many scenarios, rerun one.
+
+May import: check, engine.
+"""
 
 from __future__ import annotations
 

@@ -1,6 +1,8 @@
 """What a campaign says: rates with intervals, quantiles, first-order sensitivities, in a few lines.
 
 Takes the `xarray.Dataset` of `jaxatt.campaign.dataset`; one variable is in memory at a time.
+
+May import: check.
 """
 
 from __future__ import annotations

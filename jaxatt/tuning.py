@@ -3,6 +3,8 @@
 A cost is a function (theta, key) -> scalar: theta is any pytree of numbers, and everything random, scenarios and
 noise, comes from the key. Fixed scenarios are a cost that does not draw any. What a cost is made of is in
 `objectives`; numbers that must stay positive or within bounds are tuned through `bounded`.
+
+May import: check, engine, study.
 """
 
 from __future__ import annotations

@@ -2,6 +2,8 @@
 
 Components lead, lanes trail: every component is a scalar or an array of lanes, and batching is plain
 broadcasting. XLA sees nothing but element-wise arithmetic, which it fuses and vectorises.
+
+May import: check.
 """
 
 from __future__ import annotations
