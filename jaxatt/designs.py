@@ -67,6 +67,7 @@ def _latin(n, dims, key, index):
     return jnp.clip(u, jnp.finfo(u.dtype).tiny, 1 - jnp.finfo(u.dtype).epsneg)
 
 
+@partial(jax.jit, static_argnums=0)  # called by hand, the loops would be compiled at every call
 def _permuted(n, key, index):
     """Where a random permutation of range(n) sends the index: a Feistel network, walked until it lands inside."""
     half = max(1, (max(n - 1, 1).bit_length() + 1) // 2)  # bits; the network permutes range(4^half)
