@@ -80,7 +80,11 @@ class Campaign(NamedTuple):
 
 
 def sampling_key(key):
-    """The key that `sample` and `inputs` get: split off the campaign's, so that the noise is independent of it."""
+    """The key that `sample` and `inputs` get: split off the campaign's, so that the noise is independent of it.
+
+    Raises TypeError for what is no key and ValueError for several.
+    """
+    key = one_key(key)
     return jax.random.wrap_key_data(jax.random.key_data(jax.random.fold_in(jax.random.wrap_key_data(key), 2**32 - 1)))
 
 
@@ -128,7 +132,7 @@ def scenarios(campaign: Campaign, start: int, stop: int):
     return _drawn(campaign, start, check.whole("stop", stop, start + 1))[0]
 
 
-def results(campaign: Campaign, start: int, stop: int, advance: Callable = lambda n: None) -> dict[str, np.ndarray]:
+def _results(campaign: Campaign, start: int, stop: int, advance: Callable = lambda n: None) -> dict[str, np.ndarray]:
     """All that is stored of the scenarios start .. stop - 1, by name, each of shape (..., stop - start).
 
     start: a multiple of 128. The scores are those of `sweep`, bit for bit. advance(n): n more are done.
@@ -441,7 +445,7 @@ def _try(store: Store, block: int, compute: Callable) -> None:
 
 def _here(campaign: Campaign, spans, advance: Callable) -> Iterator:
     for start, stop in spans:
-        yield (start, stop), results(campaign, start, stop, advance)
+        yield (start, stop), _results(campaign, start, stop, advance)
 
 
 def _elsewhere(campaign: Campaign, spans, executor: Executor, advance: Callable) -> Iterator:
@@ -474,13 +478,13 @@ _loaded = lru_cache(maxsize=2)(pickle.loads)
 
 
 def _task(payload: bytes, environment: dict, start: int, stop: int) -> dict[str, np.ndarray]:
-    """`results` in a worker process, which must be like the one that sent the work."""
+    """`_results` in a worker process, which must be like the one that sent the work."""
     with jax.enable_x64(environment["x64"]):
         here = _environment()
         differ = [f"{k} is {here[k]!r}, but {environment[k]!r} there" for k in here if here[k] != environment[k]]
         if differ:
             raise ValueError(f"`executor` must have workers like this process, but these differ: {'; '.join(differ)}.")
-        return results(_loaded(payload), start, stop)
+        return _results(_loaded(payload), start, stop)
 
 
 # reading

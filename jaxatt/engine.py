@@ -55,8 +55,12 @@ class System(NamedTuple):
     check: Callable = _no_check  # (params, scenario) -> lanes of the scenario, or None; ValueError on bad input
 
 
+@check.door
 def rk4(f: Callable, t, x, h):
-    """One classical Runge-Kutta step of dx/dt = f(t, x) from t [s] over h [s]; x any pytree."""
+    """One classical Runge-Kutta step of dx/dt = f(t, x) from t [s] over h [s]; x any pytree.
+
+    Raises ValueError where f does not return the structure and shapes of x.
+    """
 
     def ahead(k, by):
         return jax.tree.map(lambda a, b: a + by * b, x, k)
@@ -68,8 +72,13 @@ def rk4(f: Callable, t, x, h):
     return jax.tree.map(lambda a, b, c, d, e: a + h / 6 * (b + 2 * (c + d) + e), x, k1, k2, k3, k4)
 
 
+@check.door
 def every(k: int, now: Now, run: Callable, held):
-    """``run()`` on ticks 0, k, 2k, ..., ``held`` on the others; all lanes share the tick, so only one is computed."""
+    """``run()`` on ticks 0, k, 2k, ..., ``held`` on the others; all lanes share the tick, so only one is computed.
+
+    Raises ValueError for k < 1 and where run does not return the structure, shapes and types of held.
+    """
+    check.whole("k", k)
     return jax.lax.cond(now.k % k == 0, run, lambda: held)
 
 

@@ -95,7 +95,7 @@ def test_however_it_is_cut_the_numbers_are_the_same(whole, tmp_path):
     assert same_data(extend(tmp_path / "grown.zarr", c, N), ds)
     assert tiny.files(tmp_path / "grown.zarr") == tiny.files(whole)
     for block in (0, 5):  # any block, by itself
-        again = module.results(module._admitted(c), block * 128, (block + 1) * 128)
+        again = module._results(module._admitted(c), block * 128, (block + 1) * 128)
         assert all(same(again[k], ds[k].values[..., block * 128 : (block + 1) * 128]) for k in ds.data_vars)
 
 

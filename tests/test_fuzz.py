@@ -12,6 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import test_fuzz_files
+import test_fuzz_verbs
 from abuse import (
     EXAMPLES,
     arrays,
@@ -46,6 +48,7 @@ from jaxatt import (
     lmmse,
     mounting,
     objectives,
+    plot,
     scores,
     sensors,
     singularity,
@@ -207,6 +210,27 @@ def test_parts(f):
 
     run()
     tidy()
+
+
+# is it all of them?
+
+
+HOUSE = {  # public for the modules of the house; a user's input has been through a door before
+    "engine": "admit block_log block_records block_scores compiled fast_cpu fit_alone like one_key raw_key traced tree_bytes",
+    "study": "logged score_shapes scored",
+}
+
+
+def test_every_public_function_is_abused():
+    by_hand = {
+        f for module in (test_fuzz_files, test_fuzz_verbs) for f in vars(module).values() if inspect.isfunction(f)
+    }
+    abused = {*by_hand, *PARTS, *(getattr(singularity, name) for name in SLOW)}
+    abused |= {getattr(plot, name) for name in test_fuzz_verbs.FIGURES}
+    for name in ("campaign", "designs", "engine", "linear", "plot", "replay", "study", "summary", "tuning"):
+        module = sys.modules[f"jaxatt.{name}"]
+        forgotten = {f.__name__ for f in public(module) if f not in abused} - set(HOUSE.get(name, "").split())
+        assert not forgotten, f"{name}: {forgotten}"
 
 
 # the shipped loops: their numbers, spoiled

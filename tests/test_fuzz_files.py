@@ -16,9 +16,9 @@ from abuse import JUNK, fuzzed, judged, junk, nearly, plain, whole
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxatt import replay
-from jaxatt.campaign import dataset, extend, run, scenarios, until
+from jaxatt.campaign import dataset, extend, run, sampling_key, scenarios, until
 from jaxatt.campaign import replay as rerun
+from jaxatt.replay import load
 from jaxatt.tuning import tune
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -82,12 +82,12 @@ def test_recorded_files(data, name, units, time):
         path = Path(folder, name)
         path.write_bytes(data)
         words = {"path", "units", "time", "gyro", "star", "note", "rad", "s", *map(str, units or ()), str(time)}
-        answered(lambda: replay.load(path, units, time=time), words)
+        answered(lambda: load(path, units, time=time), words)
 
 
 def test_what_is_no_path():
     for bad in [b for b in JUNK if not isinstance(b, str)]:
-        assert judged(replay.load, {"path"}, bad, {})
+        assert judged(load, {"path"}, bad, {})
         for f in (dataset, lambda path: run(path, campaign(), 128), lambda path: rerun(path, campaign(), 0)):
             assert judged(f, {"path"}, bad)
 
@@ -183,12 +183,14 @@ def test_campaigns(asked):
     how = {name: asked[name] for name in ("shard", "accept", "executor")} | {"progress": False}
     with TemporaryDirectory() as folder:
         path = Path(folder, "x.zarr")
+        judged(sampling_key, WORDS, asked["campaign.key"])
         said = judged(scenarios, WORDS, given_, asked["start"], asked["stop"])
         said = judged(run, WORDS, path, given_, asked["n"], **how)
         if said:
             assert not path.exists() or dataset(path).sizes["scenario"] == 0, "refused, but something was computed"
         else:
             judged(rerun, WORDS, path, given_, asked["index"])
+            judged(extend, WORDS, path, given_, asked["stop"], **how)
             judged(
                 until,
                 WORDS,

@@ -15,11 +15,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from toy import SYSTEM, Params, Scenario
 
-from jaxatt import check, linear, plot, scores
+from jaxatt import check, plot, scores
 from jaxatt.designs import factorial, iid, latin, sobol, subsets
 from jaxatt.detection import Roc
-from jaxatt.engine import noise_of, simulate, vmapped
+from jaxatt.engine import Now, every, noise_of, rk4, simulate, vmapped
 from jaxatt.faults import Reading
+from jaxatt.linear import sampled
 from jaxatt.mounting import GimbalAxes, cmg_axes
 from jaxatt.replay import checked, replay, resample, together
 from jaxatt.study import batch, rerun, sweep, varied
@@ -36,6 +37,7 @@ from jaxatt.tuning import (
     value_and_gradient,
     worst_case,
 )  # fmt: skip
+from jaxatt.vec import Vec3
 
 # the verbs, on a loop that compiles at once
 
@@ -94,7 +96,7 @@ VERBS = {
     ),
     "noise_of": (noise_of, dict(system=st.just(LOOP), key=keys, index=whole, ticks=ticks), set()),
     "linear.sampled": (
-        lambda system, params, scenario, ticks, states: linear.sampled(
+        lambda system, params, scenario, ticks, states: sampled(
             system, params, scenario, ticks=ticks, states=states),
         dict(system=st.just(LOOP), params=params, scenario=scenarios, ticks=ticks,
              states=st.sampled_from([None, ("position",), ("speed", "position"), ("colour",), (), 3])),
@@ -286,6 +288,11 @@ DATA = {
              readings=st.one_of(arrays([(4,), (4, 2)]), reading, junk), dt=st.one_of(good(0.1, 1), plain()),
              flow=st.sampled_from([None, None, lambda p, board, y: {"w": -board.w}, lambda p, board, y: board, lambda p, board, y: {"q": 1.0}, 3]),
              substeps=st.one_of(st.just(1), whole), between=st.one_of(st.none(), st.none(), arrays([(4, 1, 4), (4, 2, 4)]), junk))),
+    "rk4": (rk4, dict(f=st.sampled_from([lambda t, x: x, lambda t, x: 0.0, lambda t, x: Vec3(x, x, x), lambda x: x, None, 3]),
+                      t=plain(), x=st.one_of(plain(), vectors), h=plain())),
+    "every": (lambda k, now, run, held: every(k, now, run, held), dict(
+        k=whole, now=st.one_of(st.just(Now(jnp.asarray(3), 0.3, 0.1)), tuples(Now), junk), held=st.one_of(plain(), vectors),
+        run=st.sampled_from([lambda: 1.0, lambda: np.ones(3), lambda: Vec3(1.0, 2.0, 3.0), lambda: None, lambda x: x, None, 3]))),
 }  # fmt: skip
 ALSO = {"time", "a", "b", "q", "scenarios"}  # the channels and times that a message names
 
@@ -293,7 +300,7 @@ ALSO = {"time", "a", "b", "q", "scenarios"}  # the channels and times that a mes
 fitting = GOOD | dict(
     dims=2, counts=[1, 2], looks=[4, 6], channels=3, most=None, successes=1, trials=3, level=0.95, levels=(0.1, 0.9), role="score",
     half_width=0.3, t=np.arange(4.0), columns={"a": np.arange(4.0)}, dt=1.0, names=["a", "b"], decide=decide, flow=None, substeps=1,
-    board=Board(0.0, 0.5), between=None, n=60,
+    board=Board(0.0, 0.5), between=None, n=60, f=lambda t, x: x, x=np.ones(3), h=0.1, k=2, now=Now(4, 0.4, 0.1), run=lambda: 1.0, held=2.0,
 )  # fmt: skip
 
 
