@@ -300,6 +300,19 @@ def test_the_nees_is_that_of_plain_matrices():
     np.testing.assert_allclose(nees_q, e @ np.linalg.solve(P, e), rtol=1e-9)
 
 
+@pytest.mark.parametrize("sign", [1, -1])  # of a quaternion, which no attitude knows
+def test_the_error_of_the_multiplicative_filter_is_the_turn_to_the_estimate(sign):
+    rng = np.random.default_rng(3)
+    P, q, a = rng.normal(size=(3, 3)) * 1e-3, rng.normal(size=4), rng.normal(size=3) * 1e-6
+    P, q = P @ P.T, q / np.linalg.norm(q)
+    x = sign * left(q) @ [1, *(a / 2)]
+    turn, std, nees, nees_q = star.TURN.error(lmmse.Estimate(Quat(*x), tuple(map(tuple, P))), Quat(*q))
+    np.testing.assert_allclose(turn, a, rtol=1e-6)
+    np.testing.assert_allclose(std, np.sqrt(np.diag(P)))
+    np.testing.assert_allclose(nees, a @ np.linalg.solve(P, a), rtol=1e-6)
+    assert nees_q == nees
+
+
 # structure
 
 
