@@ -11,7 +11,7 @@ import pytest
 
 import jaxatt.systems
 from jaxatt import scores, simulate, sweep
-from jaxatt.study import batch
+from jaxatt.study import batch, varied
 
 NAMES = [module.name for module in pkgutil.iter_modules(jaxatt.systems.__path__)]
 KEY = jax.random.key(8)
@@ -38,18 +38,20 @@ def test_on_board_code_cannot_see_the_truth(loop):
     assert seen[:2] == ["params", "now"] and not {"x", "scenario", "truth"} & set(seen)
 
 
-def test_single_runs_lanes_and_vmap_agree(loop):
+def test_single_runs_lanes_vmap_and_a_design_study_agree(loop):
     keys = jax.random.split(KEY, 3)
     run = lambda scenario, key: simulate(loop.system, loop.params, scenario, key, ticks=TICKS)
     one = run(loop.scenario, keys[1])
     lanes = run(batch(loop.scenario, 3), keys)
     mapped = jax.vmap(lambda key: run(loop.scenario, key))(keys)
-    for a, b, c in zip(jax.tree.leaves(one), jax.tree.leaves(lanes), jax.tree.leaves(mapped)):
-        b = jnp.broadcast_to(b, (*a.shape, 3))[..., 1]
+    designs = simulate(varied(loop.system), (), batch((loop.params, loop.scenario), 3), keys, ticks=TICKS)
+    for a, b, c, d in zip(*map(jax.tree.leaves, (one, lanes, mapped, designs))):
+        b, d = (jnp.broadcast_to(leaf, (*a.shape, 3))[..., 1] for leaf in (b, d))
         # A leaf below 1e-6 may be all rounding, as the drift of a conserved momentum is: it has no scale of its own.
         scale = np.nanmax(np.abs(np.where(np.isfinite(a), a, 0)), initial=1e-6)
         np.testing.assert_allclose(b, a, rtol=1e-10, atol=1e-10 * scale)
         np.testing.assert_allclose(c[1], a, rtol=1e-10, atol=1e-10 * scale)
+        np.testing.assert_allclose(d, a, rtol=1e-10, atol=1e-10 * scale)
 
 
 def test_two_sets_of_numbers_compile_once(loop):
