@@ -176,7 +176,9 @@ def _table(path: Path):
             header = next(csv.reader([file.readline().decode("utf-8-sig").strip()]), [])
             names = [name.strip() for name in header]
             if len(set(names)) == len(names):
-                return pandas.read_csv(file, header=None, names=names, index_col=False, float_precision="round_trip")
+                since = tuple(map(int, pandas.__version__.split(".")[:2]))  # from 3.1 on every number is read exactly
+                exact: dict[str, Any] = {} if since >= (3, 1) else {"float_precision": "round_trip"}
+                return pandas.read_csv(file, header=None, names=names, index_col=False, **exact)
         except Exception as error:  # of pandas, PyArrow, the csv module or the decoder
             reason = " ".join(str(error).split())[:200]
             raise ValueError(f"`path` must be a {kind[1:]} file, but {path.name} is none: {reason}") from None
