@@ -142,6 +142,10 @@ def test_saved_searches(saved):
 # campaigns: what is asked
 
 
+def good(found):
+    return found.get("ok", found.scenario >= 0)  # which no score may have told
+
+
 key = jax.random.key(3)
 TINY = campaign()
 functions = st.sampled_from([None, 3, "a", lambda *a: {}, lambda *a: np.zeros(2)])  # their own errors are the user's
@@ -158,11 +162,11 @@ ASKED = dict(
     shard=st.one_of(st.sampled_from([(0, 1), (0, 2), (1, 2), (2, 2), (0,), (0, 0), (-1, 1)]), junk),
     accept=st.sampled_from([(), ["jax"], "jax", 3, None, [3]]), executor=st.sampled_from([None, None, 3, "a"]),
     index=whole, looks=st.sampled_from([[100, 128], [], [128, 100], 3, ["a"], None]), half_width=plain(), level=plain(),
-    success=st.sampled_from([lambda found: found.ok, None, 3]), start=whole, stop=st.one_of(st.just(128), whole),
+    success=st.sampled_from([good, None, 3]), start=whole, stop=st.one_of(st.just(128), whole),
     **{f"campaign.{name}": values for name, values in FIELDS.items()}, campaign=junk,
 )  # fmt: skip
 FITTING = dict(n=128, shard=(0, 1), accept=(), executor=None, index=0, looks=[100, 128], half_width=0.3, level=0.95, campaign=TINY,
-               success=lambda found: found.ok, start=0, stop=128)  # fmt: skip
+               success=good, start=0, stop=128)  # fmt: skip
 FITTING |= {f"campaign.{name}": getattr(TINY, name) for name in FIELDS}
 WORDS = {"campaign", "path", "key", "params", "score", "input", "record", "scenario", "scenarios", *ASKED, *FIELDS}
 
