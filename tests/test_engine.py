@@ -166,6 +166,9 @@ def test_a_tick_that_changes_the_state_is_told_so():
     bad = SYSTEM._replace(tick=lambda p, s, now, x, z, noise: (x, (z, z), None))
     with pytest.raises(TypeError, match="`tick` must return the structure"):
         simulate(bad, Params(), Scenario(), KEY, ticks=3)
+    bad = SYSTEM._replace(tick=lambda p, s, now, x, z, noise: (x, 1j * z, None))
+    with pytest.raises(TypeError, match=r"`tick` must return the state's type float64, but it is complex128"):
+        simulate(bad, Params(), Scenario(), KEY, ticks=3)
     bad = SYSTEM._replace(tick=lambda p, s, now, x, z, noise: (x, jnp.zeros(3), None))
     with pytest.raises(TypeError, match=r"`tick` must return shape \(\) where the state has it, but it is \(3,\)"):
         simulate(bad, Params(), Scenario(), KEY, ticks=3)
