@@ -14,7 +14,7 @@ KEY = jax.random.key(0)
 
 
 def test_an_error_in_a_function_that_is_handed_in_is_seen_whole():
-    with pytest.raises(ZeroDivisionError, match="^division by zero$"):
+    with pytest.raises(ZeroDivisionError, match=r"^division by zero$"):
         rk4(lambda t, x: 1 / 0, 0.0, 1.0, 0.1)
 
 
@@ -42,5 +42,5 @@ def test_params_carry_the_lanes_of_the_scenario_or_none():
 
 def test_a_sweep_of_nothing_is_refused():
     score = lambda params, scenario, now, log: scores.always(True)
-    with pytest.raises(ValueError, match="^`scenarios` must hold at least one array, but it is empty"):
+    with pytest.raises(ValueError, match=r"^`scenarios` must hold at least one array, but it is empty"):
         sweep(SYSTEM, Params(), (), KEY, ticks=3, score=score)
