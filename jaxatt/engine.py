@@ -302,8 +302,8 @@ def _simulate(system, ticks, every, keyed, params, scenario, source):
         def noise(c):  # pyright: ignore[reportRedeclaration]
             draw = partial(_chunk_noise, system, k0=c * chunk, ticks=chunk, lanes=(), dtype=dtype)
             draw_lanes = lambda key: draw(key)
-            for _ in lanes:
-                draw_lanes = jax.vmap(draw_lanes, in_axes=0, out_axes=-1)
+            for _ in lanes:  # the last axis first, behind it come the key's words
+                draw_lanes = jax.vmap(draw_lanes, in_axes=-2, out_axes=-1)
             return draw_lanes(source)
 
     else:

@@ -62,14 +62,6 @@ def test_lanes_vmap_and_single_runs_agree():
         np.testing.assert_allclose(np.asarray(lanes)[..., i], one, rtol=1e-12, atol=1e-14)
 
 
-def test_simulate_works_under_jit_and_grad():
-    loss = lambda gain: jnp.sum(simulate(SYSTEM, Params(gain), Scenario(), KEY, ticks=25).position ** 2)
-    assert jax.jit(loss)(0.3) == pytest.approx(float(loss(0.3)), rel=1e-12)
-    central = (loss(0.3 + 1e-5) - loss(0.3 - 1e-5)) / 2e-5
-    assert jax.grad(loss)(0.3) == pytest.approx(float(central), rel=1e-7)
-    assert jax.jacfwd(jax.jit(loss))(0.3) == pytest.approx(float(central), rel=1e-7)
-
-
 def arrays_tick(params, scenario, now, x, z, noise):
     u = -params.gain * (x[1] + 0.1 * noise[0])
     return x, u, {"x": x, "u": u}
@@ -82,6 +74,23 @@ ARRAYS = System(
     dt=0.1,
     normals=1,
 )
+
+
+@pytest.mark.parametrize("system", [SYSTEM, vmapped(ARRAYS)], ids=["lanes", "vmapped"])
+def test_two_axes_of_lanes_are_one_folded(system):
+    fold = lambda tree: jax.tree.map(lambda a: a.reshape(*a.shape[:-1], 2, 3), tree)
+    keys, scenarios = jax.random.split(KEY, 6), many(6)
+    one = simulate(system, Params(), scenarios, keys, ticks=12)
+    two = simulate(system, Params(), fold(scenarios), keys.reshape(2, 3), ticks=12)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(b, a, rtol=1e-12, atol=1e-14), fold(one), two)
+
+
+def test_simulate_works_under_jit_and_grad():
+    loss = lambda gain: jnp.sum(simulate(SYSTEM, Params(gain), Scenario(), KEY, ticks=25).position ** 2)
+    assert jax.jit(loss)(0.3) == pytest.approx(float(loss(0.3)), rel=1e-12)
+    central = (loss(0.3 + 1e-5) - loss(0.3 - 1e-5)) / 2e-5
+    assert jax.grad(loss)(0.3) == pytest.approx(float(central), rel=1e-7)
+    assert jax.jacfwd(jax.jit(loss))(0.3) == pytest.approx(float(central), rel=1e-7)
 
 
 def test_a_loop_on_plain_arrays_runs_in_lanes_through_vmapped():
