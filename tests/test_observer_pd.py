@@ -26,6 +26,14 @@ def last_outside(values, bound, dt):
     return dt * np.max(np.flatnonzero(np.asarray(values) > bound))
 
 
+def test_tracking_errors_vanish_at_the_target_alone():
+    target = op.params._replace(q_d=Vec3(0.1, 0.2, -0.1), w_d=Vec3(0.01, -0.02, 0.03))
+    e = op.errors(target, AttitudeRate(target.q_d, target.w_d))
+    np.testing.assert_allclose([*e.q, *e.w], 0, atol=1e-16)
+    e = op.errors(target, AttitudeRate(target.q_d, 2 * target.w_d))
+    np.testing.assert_allclose(e.w, target.w_d)
+
+
 @pytest.mark.parametrize("sign", [-1, 1])
 def test_the_lyapunov_identity_of_the_observer(sign):
     """V' = -alpha |xi_q|^2 - beta |xi_w|^2 for clean readings; with noise the exact form of the reference."""

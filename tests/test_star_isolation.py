@@ -313,6 +313,15 @@ def test_the_error_of_the_multiplicative_filter_is_the_turn_to_the_estimate(sign
     assert nees_q == nees
 
 
+def test_the_angle_between_two_stars_is_judged_by_its_own_variance():
+    rng = np.random.default_rng(4)
+    s, p, a, b = rng.normal(size=(4, 3)) / 3
+    believed = params._replace(stars=Vec3(*np.stack([s, p], axis=1)), std_star=0.01)
+    got = star.star_angle(Vec3(*np.stack([a, b], axis=1)), believed)
+    np.testing.assert_allclose(got, (a @ b - s @ p) ** 2 / (2e-4 * (1 - (s @ p) ** 2)), rtol=1e-9)
+    assert star.star_angle(believed.stars, believed) == 0
+
+
 # structure
 
 

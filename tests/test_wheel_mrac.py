@@ -335,13 +335,28 @@ def test_the_estimate_from_rates_finds_the_inertia():
 
 
 def test_scores_are_those_of_the_log():
-    scenarios = batch(wm.scenario, 2)
+    onset = 14.0
+    scenarios = batch(wm.scenario._replace(drive=Fault(onset=onset, scale=0.05)), 2)
     system = wm.loop(substeps=5)
     got = jaxatt.sweep(system, wm.params, scenarios, jax.random.key(3), ticks=1000, score=wm.score)
     log = jaxatt.rerun(system, wm.params, scenarios, jax.random.key(3), 1, ticks=1000)
     off = np.abs(np.asarray(log.J_hat) - wm.scenario.J_z) > 0.005 * wm.scenario.J_z
     assert off[0] and not off[-1] and got.J_settling[1] == pytest.approx(wm.DT * np.nonzero(off)[0][-1])
     np.testing.assert_allclose(got.spans[0][1], np.ptp(log.r - log.r_ideal))
+    t = wm.DT * np.arange(1000)
+    late, ill = t >= 10, t >= onset
+    error, measured = np.abs(log.error), np.abs(log.measured)
+    assert got.settling_ill[1] == pytest.approx(t[ill & (error > 0.05)][-1] - onset) and got.settling_ill[1] > 0
+    assert got.delay[1] == pytest.approx(t[ill & log.alarm][0] - onset) and got.delay[1] < 1
+    found = {
+        "peak": error.max(), "peak_late": error[late].max(), "rms": rms(error), "rms_late": rms(error[late]),
+        "peak_measured": measured.max(), "peak_measured_late": measured[late].max(), "rms_measured_late": rms(measured[late]),
+        "mean_measured": measured.mean(), "chatter": rms(log.step[late]), "peak_speed": np.abs(log.y).max(), "a_y": log.a_y[-1],
+        "a_r": log.a_r[-1], "false_alarms": log.alarm[late & ~ill].mean(), "peak_residual_ill": np.abs(log.residual[ill]).max(),
+        "peak_ill": error[ill].max(),
+    }  # fmt: skip
+    for name, value in found.items():
+        np.testing.assert_allclose(getattr(got, name)[1], value, rtol=1e-9, err_msg=name)
 
 
 @pytest.mark.slow
@@ -564,11 +579,15 @@ def test_bad_loop_and_bad_noise_are_refused():
     assert wm.loop() is wm.system
 
 
-@pytest.mark.slow
 def test_adaptation_too_fast_for_the_integration_is_warned_of():
     """sqrt(b gamma (r^2 + y^2)) = 122 rad/s at the peak with the paper's gamma."""
     fast = wm.mrac_only._replace(law=Adaptation(gamma=1e-4))
-    with pytest.warns(UserWarning, match=r"gamma` = 0.0001 .* in steps of 0.005 s, is stable only .* up to 6325 deg/s"):
+    platform = wm.params.turn / 2 * 5 / (wm.params.duration * np.tanh(2.5))  # [deg/s] at its fastest
+    wheel = platform * wm.scenario.J_z / wm.scenario.J_w
+    words = (
+        rf"gamma` = 0.0001 .* in steps of 0.005 s, is stable only .* up to 6325 deg/s, but the slew needs {wheel:.0f} "
+    )
+    with pytest.warns(UserWarning, match=words):
         jaxatt.simulate(wm.loop(substeps=4), fast, QUIET, SILENCE[:300], ticks=300)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
