@@ -16,6 +16,7 @@ with suppress(RuntimeError):  # too late where another test file has run before 
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 import pytest  # noqa: E402
+from toy import tallied  # noqa: E402
 
 from jaxatt import bodies, simulate, sweep  # noqa: E402
 from jaxatt.attitude import quat_rate, quat_rotate  # noqa: E402
@@ -385,3 +386,45 @@ def test_bad_input_is_refused_in_one_line():
         with pytest.raises(ValueError, match=words) as error:
             run(p, scenario)
         assert "\n" not in str(error.value)
+
+
+def test_scores_are_those_of_a_made_up_log():
+    rng, dt = np.random.default_rng(6), 0.5
+    three = lambda *size: Vec3(*(np.array(size) * rng.normal(size=(3, 6))))
+    four = lambda: rng.normal(size=(6, 4))
+    log = cmg.Log(
+        three(4, 3, 2, 1, 0.5, 0.01), *(four() for _ in range(4)), momentum=three(1.0), condition=np.array([3, 5, 9, 8, 9, 1.0]),
+        rank_one=np.array([False, True, False, False, True, False]), variation=rng.random(6), jumps=np.array([0, 2, 1, 0, 0, 3]),
+        acceleration=rng.random(6), w0=np.full(6, 2.5),
+    )  # fmt: skip
+    onset = np.array([np.inf, 10.0, np.inf, np.inf])
+    h = np.array([0.3, -0.4, 1.2])
+    day = cmg.scenario._replace(failure=cmg.scenario.failure._replace(onset=onset), h=Vec3(*h))
+    got = tallied(cmg.score, cmg.params, day, log, dt)
+    t, w = dt * np.arange(6), np.linalg.norm(np.stack(log.w), axis=0)
+    found = {
+        "variation": log.variation.sum(), "jumps": 6, "acceleration": np.sqrt(log.acceleration.mean()), "condition": 9.0,
+        "condition_at": 1.0, "settling": t[w > 0.05 * 2.5][-1], "final": w[-1], "start": 2.5,
+        "momentum": np.linalg.norm(np.stack(log.momentum), axis=0)[-1], "rank_one": 1.0, "ok": True,
+    }  # fmt: skip
+    for name, value in found.items():
+        np.testing.assert_allclose(getattr(got, name), value, rtol=1e-12, err_msg=name)
+    # the modules that are left hold at most their momentum at right angles to the gimbal axes
+    r = np.stack(cmg.scenario.axes.r)
+    lever = np.linalg.norm(
+        r - np.outer(h, h @ r) / (h @ h), axis=0
+    )  # sin of the angle between axis and h, r being unit
+    hull = np.sum(np.sqrt(1 - (h @ r / 1.3) ** 2) * np.isinf(onset) * cmg.scenario.module.I_ws * cmg.scenario.spin)
+    np.testing.assert_allclose(lever, np.sqrt(1 - (h @ r / 1.3) ** 2))
+    for size, fits in ((0.999, True), (1.001, False)):
+        scaled = day._replace(h=Vec3(*(h / 1.3 * hull * size)))
+        assert bool(tallied(cmg.score, cmg.params, scaled, log, dt).absorbable) is fits
+    assert tallied(cmg.score, cmg.params, day._replace(h=Vec3(0.0, 0.0, 0.0)), log, dt).absorbable
+
+
+def test_classes_of_runs():
+    run = cmg.Scores(*[None] * len(cmg.Scores._fields))
+    run = run._replace(
+        variation=np.array([20.0, 20.1, 1.0, np.nan]), final=np.array([0.2, 0.0, 0.21, 0.0]), start=np.ones(4)
+    )
+    assert cmg.classify(run).tolist() == [cmg.PROPER, cmg.FLUCTUATION, cmg.LOCK, cmg.FLUCTUATION]

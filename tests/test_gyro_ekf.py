@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from toy import tallied
 
 import jaxatt
 from jaxatt import detection
@@ -411,3 +412,49 @@ BAD = {
 def test_bad_input_is_refused_by_name(name):
     with pytest.raises(ValueError, match=name):
         jaxatt.simulate(system, *BAD[name], jax.random.key(0), ticks=1)
+
+
+@pytest.mark.parametrize("kept", [True, False])  # a filter, or none
+def test_scores_are_those_of_a_made_up_log(kept):
+    rng, dt = np.random.default_rng(5), 100.0
+    three = lambda *size: Vec3(*(np.array(size) * rng.normal(size=(3, 9))))
+    fade = np.array([9, 5, 3, 7, 2, 1, 4, 1, 0.1])
+    f = gyro_ekf.FilterLog(
+        *(rng.normal(size=(9, 17)) for _ in range(3)), *rng.random((2, 9)), rows=np.array([0, 11, 11, 5, 11, 0, 7, 11, 3]),
+        nll=rng.random(9), statistic=rng.random((9, 4)), parity=np.sin(np.arange(9.0)), dropped=np.arange(9)[:, None] >= [2, 99, 0, 7],
+    )  # fmt: skip
+    log = gyro_ekf.Log(
+        three(1.0),
+        three(0.1),
+        three(1e-4 * fade),
+        three(1.0),
+        rng.normal(size=(9, 4)),
+        rng.normal(size=(9, 4)),
+        f if kept else None,
+    )
+    score = gyro_ekf.score if kept else gyro_ekf.score_loop
+    got = tallied(score, params._replace(threshold=0.8), gyro_ekf.scenario, log, dt)
+    t, error = dt * np.arange(9), np.stack(log.error)
+    size, late = np.abs(error).max(axis=0), t >= 300
+    rms = lambda a: np.sqrt(np.mean(a**2, axis=0))
+    found = {
+        "settling": t[size > 0.01 * DEG][-1], "peak_error": size.max(), "final_error": size[-1],
+        "rms_error": np.sqrt(np.mean(np.sum(error[:, late] ** 2, axis=0))), "peak_h": np.abs(log.h).max(),
+    }  # fmt: skip
+    if kept:
+        used = late & (f.rows > 0)
+        found |= {
+            "rms_angle": rms(f.error[late, ANGLE]), "rms_w": rms(f.error[late, 6:9]), "nis": np.mean(f.nis[used] / f.rows[used]),
+            "final_bias": f.error[-1, BIAS], "statistic": f.statistic.max(axis=0), "caught": [200, np.inf, 0, 700],
+            "parity": 100.0,
+        }  # fmt: skip
+    assert {*got._fields} == {*found, "ok"} and got.ok
+    for name, value in found.items():
+        np.testing.assert_allclose(getattr(got, name), value, rtol=1e-12, err_msg=name)
+    far = log._replace(angle=log.angle._replace(y=np.linspace(0, 1.5, 9)))  # the Euler angles are lost beyond 80 deg
+    assert not tallied(score, params, gyro_ekf.scenario, far, dt).ok
+
+
+def test_the_consistent_filter_believes_the_true_noise():
+    R, s = gyro_ekf.consistent(params).R, gyro_ekf.scenario
+    np.testing.assert_allclose(R, np.square([s.std_angle] * 3 + [s.std_gyro] * 4 + [s.std_tacho] * 4))
