@@ -14,7 +14,7 @@ import jaxatt
 from jaxatt import detection
 from jaxatt.attitude import euler_rate, quat_from_euler, quat_rotate
 from jaxatt.controllers import allocation
-from jaxatt.engine import System
+from jaxatt.engine import Now, System
 from jaxatt.faults import Fault, Reading
 from jaxatt.kalman import Belief, ekf_predict, innovation, kalman_update, nees
 from jaxatt.linear import growth_rates, observability_rank, sampled
@@ -458,3 +458,11 @@ def test_scores_are_those_of_a_made_up_log(kept):
 def test_the_consistent_filter_believes_the_true_noise():
     R, s = gyro_ekf.consistent(params).R, gyro_ekf.scenario
     np.testing.assert_allclose(R, np.square([s.std_angle] * 3 + [s.std_gyro] * 4 + [s.std_tacho] * 4))
+
+
+def test_the_error_reported_is_the_angle_less_the_commanded_one():
+    slewing = params._replace(slew=Vec3(0.1, 0.2, 0.3), slew_start=0.0, slew_end=10.0)
+    x = gyro_ekf.X(*[vec3(np.array([0.3, 0.2, 0.1]))] * 3, np.zeros(4))
+    log = gyro_ekf.report(slewing, Now(0, 20.0, 0.5), x, np.zeros(4), None)
+    np.testing.assert_allclose(array(log.angle - log.error), array(gyro_ekf.target(slewing, 20.0).angle))
+    assert np.abs(array(gyro_ekf.target(slewing, 20.0).angle)).max() > 0

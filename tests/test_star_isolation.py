@@ -10,6 +10,7 @@ from functools import partial  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 import pytest  # noqa: E402
+from toy import tallied  # noqa: E402
 
 import jaxatt  # noqa: E402
 from jaxatt import Fault, Quat, Vec3, detection, lmmse, scores  # noqa: E402
@@ -411,3 +412,29 @@ def test_pointing_beyond_the_linear_range_warns_with_the_number():
         warnings.simplefilter("error")
         star.system.check(params, scenario)
         star.system_of(star.TURN).check(params, scenario._replace(q=off))
+
+
+def test_scores_are_those_of_a_made_up_log():
+    rng, dt, onset = np.random.default_rng(7), 0.5, 1.9
+    vectors = lambda *shape: Vec3(*rng.normal(size=(3, *shape)))
+    alarm = np.array([[1, 0, 1, 0, 0, 1, 0, 1, 0], [0, 1, 0, 0, 0, 0, 1, 0, 1]], bool).T
+    angle_alarm = np.array([1, 1, 0, 0, 0, 0, 0, 1, 1], bool)
+    J, nis, nees = rng.random((3, 9, 2))
+    innovation = lmmse.Innovation(**{name: nis for name in lmmse.Innovation._fields})
+    board = star.Verdict(innovation, J, alarm, alarm, np.zeros(9), np.arange(9) // 3, J[:, 0], angle_alarm)
+    q = Quat(*rng.normal(size=(4, 9)))
+    log = star.Log(q, vectors(9), vectors(9), board, vectors(9, 2), vectors(9, 2), nees, nees, vectors(9, 2), None)
+    day = scenario._replace(star=star.on_sensor(PITCH, star.tangential(PITCH, Fault(onset=onset, end=3.3, bias=1.0))))
+    got = tallied(star.score, params, day, log, dt)
+    t = dt * np.arange(9)
+    after, ill = t >= onset, (t >= onset) & (t < 3.3)
+    rms = lambda a: np.sqrt(np.mean(np.square(a), axis=0))
+    found = {
+        "delay": [2.5 - onset, 3.0 - onset], "alarm_end": [3.5 - onset, np.inf], "angle_delay": 3.5 - onset,
+        "false_alarms": alarm[~after & (t > 0)].mean(axis=0), "miss": (~alarm[ill]).mean(axis=0), "peak": J[after].max(axis=0),
+        "nis": nis[1:].mean(axis=0), "nees": nees[-1], "error": np.sqrt(np.sum(rms(np.stack(log.error).transpose(1, 0, 2)) ** 2, axis=0)),
+        "pointing": 2 * np.sqrt(np.mean(np.sum(np.square(q[1:]), axis=0))), "peak_u": np.linalg.norm(np.stack(log.u), axis=0).max(),
+        "verdict": 2, "ok": True,
+    }  # fmt: skip
+    for name in star.Scores._fields:
+        np.testing.assert_allclose(getattr(got, name), found[name], rtol=1e-12, err_msg=name)
