@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from toy import tallied
 
 from jaxatt import Fault, on_axes, scores, simulate, sweep
 from jaxatt.attitude import mrp_matrix, mrp_rate, mrp_rate_transposed
@@ -212,3 +213,26 @@ def test_bad_input_is_refused(params, scenario, message):
     with pytest.raises(ValueError, match=message) as refusal:
         simulate(op.system, op.params._replace(**params), op.scenario._replace(**scenario), KEY, ticks=3)
     assert "\n" not in str(refusal.value)
+
+
+def test_scores_are_those_of_a_made_up_log():
+    rng, dt, onset, end = np.random.default_rng(8), 2.0, 24.5, 29.0
+    three = lambda scale: Vec3(*(scale * rng.normal(size=(3, 16))))
+    e_q = three(np.where(np.arange(16) < 5, 0.1, 1e-3))
+    alarm = np.isin(np.arange(16), [0, 2, 6, 9, 10, 14])
+    log = op.Log(three(1), three(1), e_q, three(1), three(1), rng.random(16), alarm, rng.random(16))
+    fault = HEALTHY._replace(y=Fault(onset=onset, end=end, bias=1.0))
+    got = tallied(op.score, op.params, op.scenario._replace(star=HEALTHY, gyro=fault), log, dt)
+    t = dt * np.arange(16)
+    start, before, ill = t < op.START_UP, t < onset, (t >= onset) & (t < end)
+    size = lambda v: np.linalg.norm(np.stack(v), axis=0)
+    rms = lambda a: np.sqrt(np.mean(a**2))
+    q, w, u = size(log.e_q), size(log.e_w), size(log.u)
+    found = {
+        "delay": 28 - onset, "start_up_alarms": alarm[start & before].mean(), "false_alarms": alarm[~start & before].mean(),
+        "miss": (~alarm[ill]).mean(), "rms_q": rms(q), "rms_w": rms(w), "rms_q_ill": rms(q[ill]), "rms_w_ill": rms(w[ill]),
+        "peak_q": q[~start].max(), "peak_w": w[~start].max(), "settling": t[q > 0.01][-1], "rms_u": rms(u), "rms_u_ill": rms(u[ill]),
+        "peak_u": u.max(), "ok": True,
+    }  # fmt: skip
+    for name in op.Scores._fields:
+        np.testing.assert_allclose(getattr(got, name), found[name], rtol=1e-12, err_msg=name)

@@ -49,4 +49,4 @@ def tallied(score, params, scenario, log, dt):
     """The scores of a log that is made up, time first: what tick after tick adds."""
     ticks = len(jax.tree.leaves(log)[0])
     one = lambda k: score(params, scenario, Now(k, k * dt, dt), jax.tree.map(lambda a: jnp.asarray(a)[k], log))
-    return scores.values(reduce(scores.add, map(one, range(ticks))))
+    return scores.values(reduce(scores.add, map(one, jnp.arange(ticks))))
