@@ -58,7 +58,7 @@ class Mutant(NamedTuple):
 
 
 def _spared(tree: ast.Module) -> set[int]:
-    """Nodes that are no physics: annotations, and what words are made of."""
+    """Nodes that are no physics: annotations, what words are made of, and what only lends its shape."""
     spared: set[int] = set()
     for node in ast.walk(tree):
         words = [getattr(node, "annotation", None), getattr(node, "returns", None)]
@@ -69,9 +69,17 @@ def _spared(tree: ast.Module) -> set[int]:
             for part in (node.left, node.right)
         ):
             words.append(node)
+        if _lends_its_shape(node):
+            words += node.args  # pyright: ignore[reportAttributeAccessIssue]
+        if isinstance(node, ast.BinOp) and (_lends_its_shape(node.left) or _lends_its_shape(node.right)):
+            spared.add(id(node))
         for word in filter(None, words):
             spared |= {id(n) for n in ast.walk(word)}
     return spared
+
+
+def _lends_its_shape(node: ast.AST) -> bool:
+    return isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr == "zeros_like"
 
 
 def _changes(node: ast.AST) -> Iterator[tuple[str, ast.AST]]:

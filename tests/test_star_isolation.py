@@ -10,7 +10,7 @@ from functools import partial  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 import pytest  # noqa: E402
-from toy import tallied  # noqa: E402
+from toy import QUICK, tallied  # noqa: E402
 
 import jaxatt  # noqa: E402
 from jaxatt import Fault, Quat, Vec3, detection, lmmse, scores  # noqa: E402
@@ -18,6 +18,7 @@ from jaxatt.replay import replay  # noqa: E402
 from jaxatt.study import batch  # noqa: E402
 from jaxatt.systems import star_isolation as star  # noqa: E402
 from jaxatt.systems.star_isolation import ARCSEC, DEG, HEALTHY, PITCH, ROLL, params, scenario  # noqa: E402
+from jaxatt.vec import mat3  # noqa: E402
 
 KEY = jax.random.key(1)
 TICKS = 3000
@@ -323,6 +324,18 @@ def test_the_angle_between_two_stars_is_judged_by_its_own_variance():
     assert star.star_angle(believed.stars, believed) == 0
 
 
+def test_the_plant_is_eulers_equation_with_gravity_gradient():
+    rng = np.random.default_rng(5)
+    q, w = rng.normal(size=4), 1e-2 * rng.normal(size=3)
+    q /= np.linalg.norm(q)
+    J, rate = np.diag([900.0, 1100.0, 700.0]), 0.02  # [rad/s], so fast that the gradient counts
+    day = scenario._replace(q=Quat(*q), w=Vec3(*w), J=mat3(J), orbit_rate=rate, torque=Vec3(0.0, 0.0, 0.0))
+    x, z = star.system.init(params, day)
+    down = (left(q * [1, -1, -1, -1]) @ right(q) @ [0, 0, 0, 1])[1:]
+    torque = 3 * rate**2 * np.cross(down, J @ down) - np.cross(w, J @ w)
+    np.testing.assert_allclose(star.system.flow(params, day, 0.0, x, z).w, np.linalg.solve(J, torque), rtol=1e-9)
+
+
 # structure
 
 
@@ -354,14 +367,15 @@ def test_a_window_on_board_is_that_of_detection():
 def test_the_likelihood_has_the_gradient_of_central_differences(run):
     readings = jax.tree.map(lambda a: a[:400], run()[1])
 
-    @jax.jit
+    quick = partial(jax.jit, compiler_options=QUICK)
+
     def cost(theta):
         p = params._replace(std_gyro=3e-6 * jnp.exp(theta[0]), std_star=params.std_star * jnp.exp(theta[1]))
         of = innovations(star.LMMSE, p, readings)
         return 0.5 * jnp.mean(of.log_det + of.nis)
 
     at = jnp.array([0.3, -0.2])
-    reverse, forward = jax.jit(jax.grad(cost))(at), jax.jit(jax.jacfwd(cost))(at)
+    reverse, forward, cost = quick(jax.grad(cost))(at), quick(jax.jacfwd(cost))(at), quick(cost)
     np.testing.assert_allclose(reverse, forward, rtol=1e-9)
     for i, h in enumerate(1e-3 * jnp.eye(2)):
         near, far = cost(at + h) - cost(at - h), cost(at + 2 * h) - cost(at - 2 * h)

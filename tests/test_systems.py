@@ -3,11 +3,13 @@
 import importlib
 import inspect
 import pkgutil
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from toy import QUICK
 
 import jaxatt.systems
 from jaxatt import scores, simulate, sweep
@@ -40,11 +42,12 @@ def test_on_board_code_cannot_see_the_truth(loop):
 
 def test_single_runs_lanes_vmap_and_a_design_study_agree(loop):
     keys = jax.random.split(KEY, 3)
+    quick = partial(jax.jit, compiler_options=QUICK)
     run = lambda scenario, key: simulate(loop.system, loop.params, scenario, key, ticks=TICKS)
-    one = run(loop.scenario, keys[1])
-    lanes = run(batch(loop.scenario, 3), keys)
-    mapped = jax.vmap(lambda key: run(loop.scenario, key))(keys)
-    designs = simulate(varied(loop.system), (), batch((loop.params, loop.scenario), 3), keys, ticks=TICKS)
+    one, lanes = (quick(run)(*given) for given in ((loop.scenario, keys[1]), (batch(loop.scenario, 3), keys)))
+    mapped = quick(jax.vmap(lambda key: run(loop.scenario, key)))(keys)
+    study = quick(lambda pairs: simulate(varied(loop.system), (), pairs, keys, ticks=TICKS))
+    designs = study(batch((loop.params, loop.scenario), 3))
     for a, b, c, d in zip(*map(jax.tree.leaves, (one, lanes, mapped, designs))):
         b, d = (jnp.broadcast_to(leaf, (*a.shape, 3))[..., 1] for leaf in (b, d))
         # A leaf below 1e-6 may be all rounding, as the drift of a conserved momentum is: it has no scale of its own.

@@ -42,6 +42,9 @@ def flow(params, scenario, t, x, z):
     return X(x.speed, -scenario.stiffness * x.position + z + 0.05 * jnp.sin(t))
 
 
+# compiles in two thirds of the time, for tests of what no optimisation changes
+QUICK = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
+
 SYSTEM = System(init, tick, flow, dt=0.2, substeps=3, normals=2)
 
 

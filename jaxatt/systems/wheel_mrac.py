@@ -455,7 +455,8 @@ def _refuse_bad(sampled: bool, dt: float, substeps: int, params: Params, scenari
         inside = (delay >= 0) & (delay <= longest * (1 + 1e-9))
         check.each("scenario.delay", f"lie in 0 to {longest:g} s", delay, inside)
     if check.concrete((params, scenario)):
-        _warn_of_fast_adaptation(sampled, dt, substeps, params, scenario)
+        with jax.ensure_compile_time_eval():  # under jit too these are numbers
+            _warn_of_fast_adaptation(sampled, dt, substeps, params, scenario)
     return lanes
 
 
