@@ -254,6 +254,15 @@ def test_area_of_the_singular_set():
     assert sg.singular_area(THREE["pyramid"], 500) == pytest.approx(3.89, abs=0.01)
 
 
+def test_the_area_knows_no_order_of_the_modules():
+    r, s0 = np.random.default_rng(0).normal(size=(2, 3, 3))
+    r /= np.linalg.norm(r, axis=0)
+    s0 = np.cross(r, s0, axis=0)
+    axes = GimbalAxes(Vec3(*r), Vec3(*(s0 / np.linalg.norm(s0, axis=0))))
+    areas = [sg.singular_area(modules(axes, order), 400) for order in ([0, 1, 2], [1, 2, 0], [2, 1, 0])]
+    np.testing.assert_allclose(areas, areas[0], rtol=1e-3)
+
+
 def test_passability_of_the_lock():
     np.testing.assert_allclose(
         np.abs(sg.passability(FOUR["pyramid"], np.radians([90, 0, -90, 0]))), [0.144655, 0.577858], atol=1e-6

@@ -336,6 +336,22 @@ def test_the_plant_is_eulers_equation_with_gravity_gradient():
     np.testing.assert_allclose(star.system.flow(params, day, 0.0, x, z).w, np.linalg.solve(J, torque), rtol=1e-9)
 
 
+def test_feedback_from_a_filter_is_ideal_feedback_at_what_it_believes():
+    rng = np.random.default_rng(6)
+    generator, (_, z) = star.WITH_BIAS, star.system_of(star.WITH_BIAS).init(params, scenario)
+    x = rng.normal(size=(7, 2))
+    filters = z.board.filters._replace(x=lmmse.AttitudeBias(*x))
+    readings = z.sensors.readings._replace(gyro=Vec3(*rng.normal(size=3)))
+    for i in (ROLL, PITCH):
+        q = x[:4, i] / np.linalg.norm(x[:4, i])
+        believed = readings._replace(q=Quat(*q), w=readings.gyro - Vec3(*x[4:, i]))
+        got, expected = (
+            star.command(generator, params._replace(feedback=feedback, u_max=np.inf), filters, y)
+            for feedback, y in ((i + 1, readings), (0, believed))
+        )
+        np.testing.assert_allclose(got, expected, rtol=1e-12)
+
+
 # structure
 
 
