@@ -428,3 +428,12 @@ def test_classes_of_runs():
         variation=np.array([20.0, 20.1, 1.0, np.nan]), final=np.array([0.2, 0.0, 0.21, 0.0]), start=np.ones(4)
     )
     assert cmg.classify(run).tolist() == [cmg.PROPER, cmg.FLUCTUATION, cmg.LOCK, cmg.FLUCTUATION]
+
+
+def test_the_start_holds_the_total_momentum_it_is_given():
+    h = Vec3(0.3, -0.4, 1.2)
+    start = cmg.scenario._replace(h=h, rate=np.array([0.1, -0.2, 0.3, 0.4]))
+    x, _ = cmg.init(cmg.params, start)
+    at = cmg_triads(start.axes, x.gamma)
+    held = cluster_momentum(x.w, x.rate, x.spin, at, cluster_inertia(start.J, at, start.module), start.module)
+    np.testing.assert_allclose(quat_rotate(x.q, held), h, rtol=1e-12)

@@ -1,6 +1,7 @@
 """The gyro loop: mounting, Kalman core, linear analysis, and what the reference says the closed loop does."""
 
 import inspect
+import warnings
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -14,7 +15,7 @@ import jaxatt
 from jaxatt import detection
 from jaxatt.attitude import euler_rate, quat_from_euler, quat_rotate
 from jaxatt.controllers import allocation
-from jaxatt.engine import Now, System
+from jaxatt.engine import Now, System, admit
 from jaxatt.faults import Fault, Reading
 from jaxatt.kalman import Belief, ekf_predict, innovation, kalman_update, nees
 from jaxatt.linear import growth_rates, observability_rank, sampled
@@ -466,3 +467,14 @@ def test_the_error_reported_is_the_angle_less_the_commanded_one():
     log = gyro_ekf.report(slewing, Now(0, 20.0, 0.5), x, np.zeros(4), None)
     np.testing.assert_allclose(array(log.angle - log.error), array(gyro_ekf.target(slewing, 20.0).angle))
     assert np.abs(array(gyro_ekf.target(slewing, 20.0).angle)).max() > 0
+
+
+def test_the_prior_of_a_gyro_is_that_of_the_rate_and_of_its_bias():
+    P0 = np.full(17, 1e-3)
+    P0[6:9] = P0[BIAS] = 1.0
+    for R, warned in ((1.5e-6, True), (2.5e-6, False)):  # beside a variance of 2: below 1e-6 float32 is warned of
+        single = jax.tree.map(np.float32, (params._replace(P0=P0, R=np.full(11, R)), gyro_ekf.scenario))
+        with warnings.catch_warnings(record=True) as met:
+            warnings.simplefilter("always")
+            admit(system, *single)
+        assert any("float32" in str(warning.message) for warning in met) is warned
