@@ -10,6 +10,7 @@ import warnings  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 import pytest  # noqa: E402
+from toy import tallied  # noqa: E402
 
 import jaxatt  # noqa: E402
 from jaxatt import scores  # noqa: E402
@@ -357,6 +358,16 @@ def test_scores_are_those_of_the_log():
     }  # fmt: skip
     for name, value in found.items():
         np.testing.assert_allclose(getattr(got, name)[1], value, rtol=1e-9, err_msg=name)
+    some, dt = jax.tree.map(lambda a: a[:700:10], log), 10 * wm.DT  # before the fault, r is close to y
+    t, squares = dt * np.arange(70), np.stack([some.r**2, some.y**2])
+    wheel = wm.scenario.wheel
+    bound = lambda gamma: mrac_sampled_bound(Adaptation(gamma=gamma), dt, wheel.a, wheel.b, some.a_y)
+    gamma = 1.25e-6 / np.max(squares.sum(axis=0)[t >= 10] / bound(1e-6)[t >= 10])  # the sum passes the bound
+    over = (t >= 10) & (squares.sum(axis=0) >= bound(gamma))
+    fast = wm.params._replace(law=Adaptation(gamma=gamma))
+    assert tallied(wm.score, fast, wm.scenario, some, dt).unstable_at == pytest.approx(t[over][0])
+    first = np.argmax(over)
+    assert (squares[:, first] < bound(gamma)[first]).all()
 
 
 @pytest.mark.slow
