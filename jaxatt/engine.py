@@ -59,7 +59,7 @@ class System(NamedTuple):
 def rk4(f: Callable, t, x, h):
     """One classical Runge-Kutta step of dx/dt = f(t, x) from t [s] over h [s]; x any pytree.
 
-    Raises ValueError where f does not return the structure and shapes of x.
+    Raises ValueError where what f returns cannot be added to x.
     """
 
     def ahead(k, by):
