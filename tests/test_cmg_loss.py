@@ -16,7 +16,7 @@ with suppress(RuntimeError):  # too late where another test file has run before 
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 import pytest  # noqa: E402
-from toy import tallied  # noqa: E402
+from made_up import tallied  # noqa: E402
 
 from jaxatt import bodies, simulate, sweep  # noqa: E402
 from jaxatt.attitude import quat_rate, quat_rotate  # noqa: E402
@@ -411,9 +411,7 @@ def test_scores_are_those_of_a_made_up_log():
         np.testing.assert_allclose(getattr(got, name), value, rtol=1e-12, err_msg=name)
     # the modules that are left hold at most their momentum at right angles to the gimbal axes
     r = np.stack(cmg.scenario.axes.r)
-    lever = np.linalg.norm(
-        r - np.outer(h, h @ r) / (h @ h), axis=0
-    )  # sin of the angle between axis and h, r being unit
+    lever = np.linalg.norm(r - np.outer(h, h @ r) / (h @ h), axis=0)  # sine of the angle between axis and h
     hull = np.sum(np.sqrt(1 - (h @ r / 1.3) ** 2) * np.isinf(onset) * cmg.scenario.module.I_ws * cmg.scenario.spin)
     np.testing.assert_allclose(lever, np.sqrt(1 - (h @ r / 1.3) ** 2))
     for size, fits in ((0.999, True), (1.001, False)):

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from toy import tallied
+from made_up import tallied
 
 import jaxatt
 from jaxatt import detection

@@ -10,7 +10,7 @@ import warnings  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 import pytest  # noqa: E402
-from toy import tallied  # noqa: E402
+from made_up import tallied  # noqa: E402
 
 import jaxatt  # noqa: E402
 from jaxatt import scores  # noqa: E402

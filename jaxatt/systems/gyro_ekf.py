@@ -467,9 +467,7 @@ def refuse_bad(params: Params, scenario: Scenario) -> tuple:
             check.refuse(f"scenario.{name}", f"carry the lanes of the others, {lanes}", its)
     check.moments("params.J", params.J)
     check.moments("scenario.J", scenario.J)
-    for name in ("k_f", "k_p", "k_i", "k_d", "slew"):
-        check.finite(f"params.{name}", getattr(params, name))
-    for name in ("P0", "Q", "R"):
+    for name in ("k_f", "k_p", "k_i", "k_d", "slew", "P0", "Q", "R"):
         check.finite(f"params.{name}", getattr(params, name))
     check.not_negative("params.P0", params.P0)
     check.not_negative("params.Q", params.Q)
