@@ -39,7 +39,7 @@ PHYSICS = (
     "systems/wheel_mrac",
 )  # fmt: skip
 TESTS = (
-    "test_attitude", "test_vec", "test_faults", "test_detection", "test_theory", "test_observer_pd", "test_singularity",
+    "test_attitude", "test_vec", "test_linear", "test_faults", "test_detection", "test_theory", "test_observer_pd", "test_singularity",
     "test_gyro_ekf", "test_cmg_loss", "test_star_isolation", "test_wheel_mrac", "test_objectives",
 )  # fmt: skip
 FRESH = multiprocessing.get_context("forkserver")  # processes that need not import JAX again

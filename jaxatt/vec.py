@@ -197,6 +197,7 @@ def once(f, *operands):
     traced = [leaf for leaf in jax.tree.leaves(operands) if isinstance(leaf, Tracer)]
     if not traced:
         return f(*operands)
+    f = jax.jit(f, inline=True)  # traced once for its shapes and its values
     shapes = jax.eval_shape(f, *operands)
     # tied to an operand, lest reverse mode on JAX 0.10 takes the branch apart before the operand is known
     always, _ = jax.lax.optimization_barrier((jnp.asarray(True), jax.lax.stop_gradient(traced[0])))

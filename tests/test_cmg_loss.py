@@ -236,6 +236,7 @@ def test_settling_and_residual_rate(cases):
     assert (np.abs(table5.final[proper] - 5.7e-5) < 4e-5).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("params, peak, at", [(cmg.params, 52.18, 4.7), (cmg.table5, 31.56, 6.3)])
 def test_condition_of_figure_7(params, peak, at):
     log = simulate(cmg.system, params, cmg.scenario, KEY, ticks=1000, every=10)  # at the control samples

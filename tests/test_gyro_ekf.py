@@ -60,6 +60,9 @@ def test_parity_vector_sees_no_rate():
     v = np.asarray(parity_vector(axes))
     np.testing.assert_allclose(v @ matrix(axes), 0, atol=1e-15)
     np.testing.assert_allclose(v, [0.408, 0.408, 0.408, 0.707], atol=5e-4)
+    a, b, c, d = axes
+    np.testing.assert_allclose(parity_vector((a, -b, c, d)), v * [1, -1, 1, 1], atol=1e-15)
+    np.testing.assert_allclose(parity_vector((-a, b, c, d)), v * [1, -1, -1, -1], atol=1e-15)
 
 
 @pytest.mark.parametrize("up", [(1, 1, 1, 1), (0, 1, 1, 1), (0, 1, 1, 0)])
@@ -350,6 +353,46 @@ def test_orbital_rate_is_the_same_in_truth_and_filter():
     np.testing.assert_allclose(true.h, z.board.u)
 
 
+def test_the_truth_obeys_eulers_equation():
+    """J w' + W h' + w x (J w + W h) = disturbance, whatever the wheels give of what is asked; eq. (3)."""
+    rng = np.random.default_rng(4)
+    J = np.diag([900.0, 1100.0, 1300.0]) + 20 * (lambda a: a + a.T)(rng.normal(size=(3, 3)))
+    scenario = Scenario(
+        h=rng.normal(size=4), torque_max=1.0, w=Vec3(*rng.normal(size=3)), disturbance=Vec3(0.1, -0.2, 0.3), J=mat3(J), gamma=0.7
+    )
+    x, z = gyro_ekf.init(params, scenario)
+    asked, effect, offset = (rng.normal(size=4) for _ in range(3))
+    z = z._replace(
+        board=z.board._replace(u=jnp.asarray(asked)), motors=z.motors._replace(gain=effect, offset=offset)
+    )
+    rate = gyro_ekf.flow(params, scenario, 0.0, x, z)
+    W, w, h = matrix(wheel_pyramid(0.7)).T, array(x.w), np.asarray(x.h)
+    np.testing.assert_allclose(rate.h, effect * np.clip(asked, -scenario.torque_max, scenario.torque_max) + offset)
+    torque = J @ array(rate.w) + W @ rate.h + np.cross(w, J @ w + W @ h)
+    np.testing.assert_allclose(torque, [0.1, -0.2, 0.3], atol=1e-12)
+
+
+def test_the_sensors_read_the_truth_the_bias_and_noise_of_their_own():
+    """What is not sampled, and a gyro stuck from the start, shows the last reading; before the first, the truth's."""
+    rng = np.random.default_rng(5)
+    truth, noise = rng.normal(size=(4, 4)), rng.normal(size=11)
+    (angle, w), (h, bias) = truth[:2, :3], truth[2:]
+    size = dict(std_angle=0.1, std_gyro=0.2, std_tacho=0.3)
+    second = failed([0, 1, 0, 0])._replace(stuck=np.ones(4))
+    stuck = Scenario(angle=Vec3(*angle), w=Vec3(*w), h=h, bias=bias, gyro=second, **size)
+    x, z = gyro_ekf.init(params, stuck)
+    rates = matrix(gyro_pyramid(stuck.alpha, stuck.beta)) @ w + bias
+    noisy = rates + 0.2 * noise[3:7]
+    for k, fresh in ((2, [1, 1, 1]), (3, [1, 0, 0])):
+        y = gyro_ekf.sense(params, stuck, Now(jnp.asarray(k), jnp.asarray(k * DT), DT), x, z, jnp.asarray(noise))
+        np.testing.assert_allclose(y.angle.value, angle + 0.1 * noise[:3] * fresh, rtol=1e-12)
+        np.testing.assert_array_equal(y.angle.valid, np.array(fresh, bool))
+        np.testing.assert_allclose(y.gyro.value, np.where([0, 1, 0, 0], rates, noisy), rtol=1e-12)
+        np.testing.assert_array_equal(y.gyro.valid, [True, False, True, True])
+        np.testing.assert_allclose(y.tacho.value, h + 0.3 * noise[7:], rtol=1e-12)
+        np.testing.assert_array_equal(y.integral, np.zeros(3))
+
+
 def test_slew_is_one_motion():
     p = params._replace(slew=Vec3(1e-3, -2e-3, 5e-4), slew_start=10.0, slew_end=60.0, orbit_rate=1e-4)
     for t in (5.0, 30.0, 80.0):
@@ -358,6 +401,52 @@ def test_slew_is_one_motion():
         np.testing.assert_allclose(slope(lambda a: a.integral), array(aim.angle), atol=1e-15)
         rate = array(euler_rate(aim.angle, aim.w)) - np.array([0, 0, p.orbit_rate])
         np.testing.assert_allclose(slope(lambda a: a.angle), rate, atol=1e-16)
+    slew = array(p.slew)
+    for t, seconds, integral in ((5.0, 0, 0), (30.0, 20, 20**2 / 2), (80.0, 50, 50**2 / 2 + 20 * 50)):
+        aim = gyro_ekf.target(p, t)
+        np.testing.assert_allclose(array(aim.angle), seconds * slew, atol=1e-16)
+        np.testing.assert_allclose(array(aim.integral), integral * slew, atol=1e-15)
+
+
+def test_the_command_closes_on_what_is_off_the_slew():
+    rng = np.random.default_rng(6)
+    p = params._replace(slew=Vec3(1e-3, -2e-3, 5e-4), slew_start=10.0, slew_end=60.0, gamma=0.6, torque_max=10.0)
+    assert gyro_ekf.refuse_bad(p, gyro_ekf.scenario) == ()
+    aim, up = gyro_ekf.target(p, 30.0), jnp.array([1.0, 1.0, 0.0, 1.0])
+    off = 1e-3 * rng.normal(size=(3, 3))
+    at = [Vec3(*(array(a) + d)) for a, d in zip((aim.integral, aim.angle, aim.w), off)]
+    gains = [np.diag(array(k)) for k in (p.k_f, p.k_i, p.k_p, p.k_d)]
+    T = gains[0] @ sum(k @ d for k, d in zip(gains[1:], off))  # eq. (5)
+    u = np.linalg.pinv(matrix(wheel_pyramid(0.6)).T * np.array(up)) @ T
+    now = Now(jnp.asarray(240), jnp.asarray(30.0), DT)
+    assert (np.abs(u) > 10).sum() == 1  # one wheel is at its limit
+    np.testing.assert_allclose(gyro_ekf.command(p, now, up, *at), np.clip(u, -10, 10), rtol=1e-4)
+
+
+def test_the_suspicion_is_that_of_plain_matrices():
+    rng = np.random.default_rng(7)
+    L, R, mean = rng.normal(size=(17, 17)), rng.uniform(0.5, 2, 11), rng.normal(size=5)
+    x, P, y = rng.normal(size=17), L @ L.T, rng.normal(size=11)
+    p = params._replace(R=R, memory=0.3)
+    _, z = gyro_ekf.init(p, gyro_ekf.scenario)
+    board = z.board._replace(mean=mean, dropped=jnp.array([False, True, False, False]))
+    valid = lambda *v: jnp.array(v, bool)
+    G = matrix(gyro_pyramid(p.alpha, p.beta))
+    H = np.zeros((11, 17))
+    H[:3, 3:6], H[3:7, 6:9], H[3:7, 13:], H[7:, 9:13] = np.eye(3), G, np.eye(4), np.eye(4)
+    e, S = y - H @ x, H @ P @ H.T + np.diag(R)
+    v = np.asarray(parity_vector(gyro_pyramid(p.alpha, p.beta)))
+    parity = v @ e[3:7] / np.sqrt(v @ S[3:7, 3:7] @ v)
+    normal = e[3:7] / np.sqrt(np.diag(S)[3:7])
+    for third, k in ((True, 7), (False, 7), (True, 0)):
+        readings = gyro_ekf.Readings(
+            Reading(y[:3], valid(1, 0, 1)), Reading(y[3:7], valid(1, 1, third, 1)), Reading(y[7:], valid(1, 1, 1, 1)), jnp.ones(4), y[:3]
+        )
+        got = gyro_ekf.suspect(p, Now(jnp.asarray(k), jnp.asarray(k * DT), DT), board, Belief(x, P), readings)
+        usable = np.array([1, 0, third, 1, third]) * (k > 0)  # the second is dropped: its parity is still told
+        moved = mean + 0.3 * (usable * np.r_[normal, parity] - mean)
+        np.testing.assert_allclose(got.mean, moved, rtol=1e-9)
+        np.testing.assert_allclose([*got.gyro, got.parity], moved**2 * 1.7 / 0.3, rtol=1e-9)
 
 
 # detection
@@ -400,6 +489,7 @@ BAD = {
     "params.memory": (params._replace(memory=0.0), Scenario()),
     "params.threshold": (params._replace(threshold=-1.0), Scenario()),
     "params.gamma": (params._replace(gamma=0.0), Scenario()),
+    "params.slew_end - slew_start": (params._replace(slew_start=10.0, slew_end=5.0), Scenario()),
     "scenario.beta": (params, Scenario(beta=2.0)),
     "scenario.std_gyro": (params, Scenario(std_gyro=-1e-6)),
     "scenario.announced": (params, Scenario(announced=0.5)),

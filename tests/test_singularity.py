@@ -9,7 +9,7 @@ import numpy as np  # noqa: E402
 import pytest  # noqa: E402
 
 from jaxatt import singularity as sg  # noqa: E402
-from jaxatt.mounting import GimbalAxes, cmg_axes, cmg_triads, modules  # noqa: E402
+from jaxatt.mounting import GimbalAxes, check_gimbal_axes, cmg_axes, cmg_triads, modules  # noqa: E402
 from jaxatt.vec import Mat3, Vec3  # noqa: E402
 
 SKEWS = {"pyramid": 54.7, "box": 90.0}
@@ -205,6 +205,14 @@ def test_holes_of_the_box_are_discs():
     assert np.isnan(sg.singular_momentum(THREE["box"], Vec3(*np.eye(3)[:, :1]), np.ones(3))[0].x).all()
 
 
+@pytest.mark.parametrize(
+    ("momentum", "distance"), [((0.9, 0.5, 0), 0.1), ((1.1, -1, 1), 0.1), ((1, 1, 0.5), 0), ((1, 2.3, 0), 0.3)]
+)
+def test_clearance_from_a_disc(momentum, distance):
+    """Over it, in it, and beside it: the discs x = +-1 of three modules of the box reach 2 from the axis."""
+    assert sg.clearance(THREE["box"], momentum) == pytest.approx(distance, abs=1e-9)
+
+
 def test_clearance_of_zero_momentum():
     assert sg.clearance(THREE["box"], np.zeros(3)) == pytest.approx(1, abs=1e-6)
     assert sg.clearance(THREE["pyramid"], np.zeros(3)) == pytest.approx(0.15419, abs=1e-4)
@@ -312,6 +320,19 @@ def test_bad_input_is_refused_in_one_line():
         sg.singular_area(FOUR["box"])
     with pytest.raises(ValueError, match="three modules"):
         sg.rearrange_by_gradient(FOUR["box"], np.zeros(4))
+
+
+def test_axes_and_what_is_used_must_fit_each_other():
+    box = THREE["box"]
+    uneven = GimbalAxes(Vec3(box.r.x[:2], *box.r[1:]), box.s0)
+    for axes, used in ((box, np.ones(4, bool)), (uneven, True), (uneven, np.ones(3, bool))):
+        with pytest.raises(ValueError, match="`axes` must have components of one shape, that of `used` too"):
+            check_gimbal_axes("axes", axes, used)
+    with pytest.raises(ValueError, match=r"`used` must have the shape of the axes, \(3,\), but it is \(2, 3\)"):
+        check_gimbal_axes("axes", box, np.ones((2, 3), bool))
+    check_gimbal_axes("axes", FOUR["box"], [True, True, False, True])
+    with pytest.raises(ValueError, match="at least 3"):
+        check_gimbal_axes("axes", FOUR["box"], [True, False, False, True])
 
 
 @pytest.mark.parametrize("m", [100, 1000])

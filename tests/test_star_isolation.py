@@ -271,6 +271,7 @@ def test_the_other_filters_are_consistent(run, number):
     np.testing.assert_allclose(nis.mean(axis=0), 3, atol=4 * np.sqrt(6 / TICKS))
 
 
+@pytest.mark.slow
 def test_seven_states_without_a_bias_are_the_four(run):
     _, readings, _ = run()
     tiny = params._replace(std_bias=1e-14)
@@ -329,11 +330,15 @@ def test_the_plant_is_eulers_equation_with_gravity_gradient():
     q, w = rng.normal(size=4), 1e-2 * rng.normal(size=3)
     q /= np.linalg.norm(q)
     J, rate = np.diag([900.0, 1100.0, 700.0]), 0.02  # [rad/s], so fast that the gradient counts
-    day = scenario._replace(q=Quat(*q), w=Vec3(*w), J=mat3(J), orbit_rate=rate, torque=Vec3(0.0, 0.0, 0.0))
+    J[0, 1] = J[1, 0] = 50.0
+    wheels, outside = rng.normal(size=(2, 3))
+    day = scenario._replace(q=Quat(*q), w=Vec3(*w), J=mat3(J), orbit_rate=rate, torque=Vec3(*outside))
     x, z = star.system.init(params, day)
+    moved = star.system.flow(params, day, 0.0, x, z._replace(torque=Vec3(*wheels)))
     down = (left(q * [1, -1, -1, -1]) @ right(q) @ [0, 0, 0, 1])[1:]
-    torque = 3 * rate**2 * np.cross(down, J @ down) - np.cross(w, J @ w)
-    np.testing.assert_allclose(star.system.flow(params, day, 0.0, x, z).w, np.linalg.solve(J, torque), rtol=1e-9)
+    torque = wheels + outside + 3 * rate**2 * np.cross(down, J @ down) - np.cross(w, J @ w)
+    np.testing.assert_allclose(moved.w, np.linalg.solve(J, torque), rtol=1e-9)
+    np.testing.assert_allclose(moved.q, 0.5 * (right(np.r_[0, w]) - left([0, 0, -rate, 0])) @ q, rtol=1e-12)  # eq. (2)
 
 
 def test_feedback_from_a_filter_is_ideal_feedback_at_what_it_believes():
@@ -352,14 +357,35 @@ def test_feedback_from_a_filter_is_ideal_feedback_at_what_it_believes():
         np.testing.assert_allclose(got, expected, rtol=1e-12)
 
 
+def test_the_torque_is_pd_about_the_target_in_the_orbit_frame():
+    rng = np.random.default_rng(7)
+    q, target, w = rng.normal(size=4), rng.normal(size=4), rng.normal(size=3)
+    q, target = q / np.linalg.norm(q), target / np.linalg.norm(target)
+    p = params._replace(q_d=Quat(*target), orbit_rate=0.2, bandwidth=0.3, damping=0.7, u_max=np.inf)
+    _, z = star.init(star.LMMSE, 1, p, scenario)
+    readings = z.sensors.readings._replace(q=Quat(*q), w=Vec3(*w))
+    J = np.stack([np.array(row) for row in p.J])
+    e = left(target * [1, -1, -1, -1]) @ q
+    orbit = (left(q * [1, -1, -1, -1]) @ right(q) @ [0, 0, -0.2, 0])[1:]
+    u = np.cross(w, J @ w) - J @ (2 * 0.3**2 * np.sign(e[0]) * e[1:] + 2 * 0.7 * 0.3 * (w - orbit))
+    np.testing.assert_allclose(star.command(star.LMMSE, p, z.board.filters, readings), u, rtol=1e-12)
+    limited = star.command(star.LMMSE, p._replace(u_max=1.0), z.board.filters, readings)
+    np.testing.assert_allclose(limited, np.clip(u, -1, 1), rtol=1e-12)
+
+
 # structure
 
 
 def test_every_reading_has_noise_of_its_own():
-    s = healthy._replace(std_gyro=1e-3, std_star=1e-3, walk=1e-3)
+    s = healthy._replace(std_gyro=1e-3, std_star=1e-3, walk=1e-3, bias=Vec3(0.1, -0.2, 0.3))
     x, z = star.init(star.LMMSE, 1, params, s)
     read = lambda noise: star.sense(params, s, jaxatt.Now(0, 0.0, DT), x, z, jnp.asarray(noise))
     loud, quiet = read(np.arange(1.0, 13.0)), read(np.zeros(12))
+    q = np.array(s.q)
+    for star_, shown in zip(np.eye(3), rows(quiet.readings.stars)):  # eq. (6)
+        np.testing.assert_allclose(shown, (left(q * [1, -1, -1, -1]) @ right(q) @ np.r_[0, star_])[1:], atol=1e-12)
+    np.testing.assert_allclose(rows(quiet.readings.gyro), np.array(s.w) + [0.1, -0.2, 0.3], rtol=1e-12)  # eq. (4)
+    np.testing.assert_allclose(rows(quiet.bias), [0.1, -0.2, 0.3], rtol=1e-12)
     off = jax.tree.map(lambda a, b: np.asarray(a - b), loud, quiet)
     np.testing.assert_allclose(rows(off.readings.gyro), [1e-3, 2e-3, 3e-3], rtol=1e-9)
     np.testing.assert_allclose(rows(off.bias), 1e-3 * DT**0.5 * np.array([4.0, 5.0, 6.0]), rtol=1e-9)

@@ -232,19 +232,23 @@ def oracle(params, scenario, v, ticks, substeps, sampled):
     """The loop of the reference written down once more, in plain floats. Rows: theta, y, a_r, a_y, r, a, P."""
     p, s, dt = params, scenario, wm.DT
     a_z = -s.J_w / s.J_z
-    theta_w = y = y_m = 0.0
+    theta_w = y = y_m = predicted = then = read_then = 0.0
     ar, ay, a_hat, P = p.a_r, p.a_y, -p.J_w / p.J_hat, p.P0
     rows = []
     for k in range(ticks):
         t = k * dt
         measured = a_z * theta_w + v[k]
         if p.ope and k:
-            P = P / (1 + P * theta_w**2 * dt)
-            a_hat = a_hat - P * theta_w * (theta_w * a_hat - measured) * dt
+            w, z = ((theta_w - then) / dt, (measured - read_then) / dt) if p.differenced else (theta_w, measured)
+            P = P / (np.exp(-p.forget * dt) + P * w**2 * dt)
+            a_hat, P = min(a_hat - P * w * (w * a_hat - z) * dt, -p.J_w / p.J_most), min(P, p.P0)
         arg = 5 * (t - p.duration / 2) / p.duration
         target = p.turn / 2 * (np.tanh(arg) / np.tanh(2.5) + 1)
         rate = p.turn / 2 * 5 / p.duration / np.cosh(arg) ** 2 / np.tanh(2.5)
-        r = (rate + p.K * (target - (a_hat * theta_w if p.ope else measured))) / a_hat
+        predicted, then = (predicted + a_hat * (theta_w - then) if p.differenced else a_hat * theta_w), theta_w
+        read_then = measured
+        feedback = predicted + p.blend * (measured - predicted) if p.ope else measured
+        r = (p.forward * rate + p.K * (target - feedback)) / a_hat
         rows.append([a_z * theta_w, y, ar, ay, r, a_hat, P])
         held = ar * r + ay * y
 
@@ -273,6 +277,7 @@ def oracle(params, scenario, v, ticks, substeps, sampled):
     [
         (wm.mrac_only, wm.scenario, False),
         (wm.params, wm.scenario, False),
+        (wm.params._replace(differenced=1.0, blend=0.3, forward=0.9, turn=-60.0, forget=0.1), wm.scenario, False),
         (wm.hardware_params, wm.hardware_scenario._replace(noise=0.05), True),
     ],
 )
@@ -600,6 +605,10 @@ def test_adaptation_too_fast_for_the_integration_is_warned_of():
     )
     with pytest.warns(UserWarning, match=words):
         jaxatt.simulate(wm.loop(substeps=4), fast, QUIET, SILENCE[:300], ticks=300)
+    softened = Adaptation(gamma=1e-4, normalise=1e-8)  # by 1 + 2e-8 wheel^2
+    limit = 2 * 4 / wm.DT / np.sqrt(2e-4 * QUIET.wheel.b / (1 + 2e-8 * wheel**2))
+    with pytest.warns(UserWarning, match=rf"only .* up to {limit:.0f} deg/s"):
+        jaxatt.simulate(wm.loop(substeps=4), fast._replace(law=softened), QUIET, SILENCE[:300], ticks=300)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         jaxatt.simulate(wm.loop(substeps=4), wm.mrac_only, QUIET, SILENCE[:300], ticks=300)

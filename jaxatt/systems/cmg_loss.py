@@ -159,7 +159,7 @@ def init(params: Params, scenario: Scenario):
     w = inverse(J_T) @ (scenario.h - stored)
     none = jnp.zeros_like(scenario.gamma)
     known = scenario.axes if scenario.known is None else scenario.known
-    x = X(Quat(o + 1, o, o, o), w, scenario.gamma, scenario.rate, scenario.spin)
+    x = X(Quat(jnp.ones_like(o), o, o, o), w, scenario.gamma, scenario.rate, scenario.spin)
     return x, Z(Board(known, Vec3(o, o, o), none), Drive(none, none, none), scenario.rate, norm(w))
 
 

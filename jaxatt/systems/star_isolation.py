@@ -337,7 +337,7 @@ def decide(params: Params, now, board: Board, readings: Readings, generator: Gen
     lengths = norm(readings.stars)
     pointing = readings.stars / jnp.where(lengths > 0, lengths, 1)
     y = Vec3(*(jnp.where(params.unit > 0, a, b) for a, b in zip(pointing, readings.stars)))
-    step = lambda: advanced(generator, params, board.filters, board.gyro, y, now.dt)
+    step = jax.jit(lambda: advanced(generator, params, board.filters, board.gyro, y, now.dt), inline=True)
     start = lambda: (board.filters, jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(step)[1]))
     filters, innovation = jax.lax.cond(now.k > 0, step, start)
 
@@ -397,7 +397,7 @@ def tick(generator: Generator, params: Params, scenario: Scenario, now, x: X, z:
 def flow(params: Params, scenario: Scenario, t, x: X, z: Z) -> X:
     """dx/dt between ticks."""
     o = jnp.zeros_like(x.q.w)
-    down = seen(x.q, Vec3(o, o, o + 1))
+    down = seen(x.q, Vec3(o, o, jnp.ones_like(o)))
     u = z.torque + gravity_gradient(down, scenario.J, scenario.orbit_rate) + scenario.torque
     w_r = Quat(o, *orbit_rate(scenario.orbit_rate))
     return X(
