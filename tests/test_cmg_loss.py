@@ -292,6 +292,50 @@ def test_the_gyro_reads_rate_bias_and_noise():
     assert read.healthy.tolist() == [1, 1, 1, 0] and (read.gamma == x.gamma).all()
 
 
+def test_one_tick_is_the_equations_in_plain_numbers():
+    rng = np.random.default_rng(8)
+    day = cmg.lost(P, (10, 55, 45, -10), module=1, brake=2e-3, free=1.0)._replace(u_max=0.3, tau_g=0.2)
+    healthy = np.array([1.0, 0, 1, 1])
+    q, w, integral = rng.normal(size=4), 2e-4 * rng.normal(size=3), 2e-4 * rng.normal(size=3)
+    rate, before, u_before = rng.normal(size=(3, 4))
+    q /= np.linalg.norm(q)
+    x, z = cmg.init(cmg.params, day)
+    x = x._replace(q=Quat(*(2 * q)), w=Vec3(*w), rate=jnp.asarray(rate))
+    board, drive = z.board._replace(integral=Vec3(*integral)), z.drive._replace(u=jnp.asarray(u_before))
+    z = z._replace(rate=jnp.asarray(before), board=board, drive=drive)
+    tick = lambda k: cmg.tick(cmg.params, day, Now(jnp.asarray(k), jnp.asarray(k * cmg.DT), cmg.DT), x, z, jnp.zeros(3))
+    moved, after, log = tick(20)
+
+    m, at = cmg.MODULE, cmg_triads(day.axes, day.gamma)
+    r, s, T = (np.stack([np.asarray(c) for c in v]) for v in at)
+    J_T = (
+        np.stack([np.array(row) for row in day.J]) + m.I_cr * r @ r.T + m.I_cs * s @ s.T + m.I_ct * T @ T.T
+    )  # eq. (11)
+    integral = integral - 0.1 * w
+    a = -J_T @ (-0.2 * w + 0.02 * integral) / (m.I_ws * 600)  # eq. (7)
+    wanted = np.linalg.pinv(T * healthy) @ a
+    u = healthy * np.clip(wanted, -0.3, 0.3)
+    np.testing.assert_allclose(array(after.board.integral), integral, rtol=1e-12)
+    np.testing.assert_allclose(after.board.u, wanted, rtol=1e-9, atol=1e-12)
+    assert (np.abs(wanted) > 0.3).any() and (np.abs(u) == 0.3).sum() < 3
+    for got in (log.u, after.drive.u):
+        np.testing.assert_allclose(got, u, rtol=1e-9)
+    np.testing.assert_allclose(after.drive.brake, 2e-3 * (1 - healthy))
+    np.testing.assert_allclose(after.drive.free, 1 - healthy)
+    np.testing.assert_allclose(after.rate, rate)
+    np.testing.assert_allclose(array(moved.q), q, rtol=1e-12)
+    np.testing.assert_allclose(log.variation, healthy @ np.abs(rate - before), rtol=1e-12)
+    assert log.jumps == (np.abs(u - u_before) > 0.3).sum() and 0 < log.jumps < 4
+    np.testing.assert_allclose(log.acceleration, healthy @ ((u - rate) / 0.2) ** 2 / 3, rtol=1e-9)
+    sizes = np.linalg.svd(T * healthy, compute_uv=False)
+    np.testing.assert_allclose(log.condition, sizes[0] / sizes[2], rtol=1e-9)
+    h = J_T @ w + m.I_cr * r @ rate + m.I_ws * 600 * s.sum(1)
+    np.testing.assert_allclose(array(log.momentum), array(quat_rotate(Quat(*q), Vec3(*h))), rtol=1e-12)
+    between = tick(21)[1].board  # no control sample
+    np.testing.assert_array_equal(between.u, z.board.u)
+    np.testing.assert_array_equal(array(between.integral), array(z.board.integral))
+
+
 def test_six_modules_with_three_lost():
     axes = cmg_axes(np.radians(60.0), np.arange(6) * np.pi / 3)
     failure = cmg.Failure(

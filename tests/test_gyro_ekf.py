@@ -358,13 +358,16 @@ def test_the_truth_obeys_eulers_equation():
     rng = np.random.default_rng(4)
     J = np.diag([900.0, 1100.0, 1300.0]) + 20 * (lambda a: a + a.T)(rng.normal(size=(3, 3)))
     scenario = Scenario(
-        h=rng.normal(size=4), torque_max=1.0, w=Vec3(*rng.normal(size=3)), disturbance=Vec3(0.1, -0.2, 0.3), J=mat3(J), gamma=0.7
+        h=rng.normal(size=4),
+        torque_max=1.0,
+        w=Vec3(*rng.normal(size=3)),
+        disturbance=Vec3(0.1, -0.2, 0.3),
+        J=mat3(J),
+        gamma=0.7,
     )
     x, z = gyro_ekf.init(params, scenario)
     asked, effect, offset = (rng.normal(size=4) for _ in range(3))
-    z = z._replace(
-        board=z.board._replace(u=jnp.asarray(asked)), motors=z.motors._replace(gain=effect, offset=offset)
-    )
+    z = z._replace(board=z.board._replace(u=jnp.asarray(asked)), motors=z.motors._replace(gain=effect, offset=offset))
     rate = gyro_ekf.flow(params, scenario, 0.0, x, z)
     W, w, h = matrix(wheel_pyramid(0.7)).T, array(x.w), np.asarray(x.h)
     np.testing.assert_allclose(rate.h, effect * np.clip(asked, -scenario.torque_max, scenario.torque_max) + offset)
@@ -440,7 +443,11 @@ def test_the_suspicion_is_that_of_plain_matrices():
     normal = e[3:7] / np.sqrt(np.diag(S)[3:7])
     for third, k in ((True, 7), (False, 7), (True, 0)):
         readings = gyro_ekf.Readings(
-            Reading(y[:3], valid(1, 0, 1)), Reading(y[3:7], valid(1, 1, third, 1)), Reading(y[7:], valid(1, 1, 1, 1)), jnp.ones(4), y[:3]
+            Reading(y[:3], valid(1, 0, 1)),
+            Reading(y[3:7], valid(1, 1, third, 1)),
+            Reading(y[7:], valid(1, 1, 1, 1)),
+            jnp.ones(4),
+            y[:3],
         )
         got = gyro_ekf.suspect(p, Now(jnp.asarray(k), jnp.asarray(k * DT), DT), board, Belief(x, P), readings)
         usable = np.array([1, 0, third, 1, third]) * (k > 0)  # the second is dropped: its parity is still told

@@ -10,7 +10,9 @@ from jaxatt.linear import _exponential, observability_rank
 jax.config.update("jax_enable_x64", True)
 
 
-@pytest.mark.parametrize("A", [[[4.0]], [[0.0]], [[0.0, 40.0], [-40.0, 0.0]], [[-1.0, 3.0, 0.5], [0, -2, 1], [0.1, 0, -5]]])
+@pytest.mark.parametrize(
+    "A", [[[4.0]], [[0.0]], [[0.0, 40.0], [-40.0, 0.0]], [[-1.0, 3.0, 0.5], [0, -2, 1], [0.1, 0, -5]]]
+)
 def test_the_exponential_is_scipys(A):
     """4 is the hard one: halved to 1 and no further, fifteen terms are not enough."""
     np.testing.assert_allclose(_exponential(np.array(A)), expm(np.array(A)), rtol=2e-14, atol=2e-14)

@@ -7,14 +7,15 @@ import pytest
 from made_up import tallied
 
 from jaxatt import Fault, on_axes, scores, simulate, sweep
-from jaxatt.attitude import mrp_matrix, mrp_rate, mrp_rate_transposed
+from jaxatt.attitude import mrp_error, mrp_matrix, mrp_rate, mrp_rate_transposed
 from jaxatt.bodies import body_acceleration
 from jaxatt.controllers import adapted_rate_gain, rate_gain_floor
-from jaxatt.engine import rk4
+from jaxatt.engine import Now, rk4
 from jaxatt.estimators import AttitudeRate, mrp_observer
+from jaxatt.faults import Channel
 from jaxatt.study import batch
 from jaxatt.systems import observer_pd as op
-from jaxatt.vec import Vec3, array, cross, inverse, norm, vec3
+from jaxatt.vec import Vec3, array, cross, inverse, mat3, norm, vec3
 
 HEALTHY = on_axes(Fault())
 QUIET = op.scenario._replace(star=HEALTHY, gyro=HEALTHY, std_q=0.0, std_w=0.0)
@@ -53,6 +54,42 @@ def test_the_lyapunov_identity_of_the_observer(sign):
             - sign * (e_w @ cross(w_hat, J @ n_w)) - e_w @ mrp_rate_transposed(y.q, n_q)
         )  # fmt: skip
         np.testing.assert_allclose(dV, expected, atol=1e-10)
+
+
+def test_the_flow_is_the_papers_equations_in_plain_matrices():
+    """Sensors err between ticks as their channels say; the board knows another inertia than the body has."""
+    rng = np.random.default_rng(9)
+    full = lambda: np.diag(rng.uniform(50, 90, 3)) + 2 * (lambda a: a + a.T)(rng.normal(size=(3, 3)))
+    (J, believed), (q, w, q_hat, w_hat, q_d, w_d) = (full(), full()), 0.3 * rng.normal(size=(6, 3))
+    (gain_q, gain_w), (off_q, off_w) = rng.uniform(0.5, 1.5, (2, 3)), 0.1 * rng.normal(size=(2, 3))
+    p = op.params._replace(J=mat3(believed), q_d=Vec3(*q_d), w_d=Vec3(*w_d))
+    x, z = op.init(p, op.scenario._replace(J=mat3(J), q=Vec3(*q), w=Vec3(*w), q_hat=Vec3(*q_hat), w_hat=Vec3(*w_hat)))
+    channels = lambda gain, off: Vec3(*map(Channel, gain, off))
+    z = z._replace(sensors=z.sensors._replace(star=channels(gain_q, off_q), gyro=channels(gain_w, off_w)))
+
+    def G(q):
+        S = np.array([[0, -q[2], q[1]], [q[2], 0, -q[0]], [-q[1], q[0], 0]])
+        return ((1 - q @ q) * np.eye(3) + 2 * S + 2 * np.outer(q, q)) / 4
+
+    y_q, y_w = gain_q * q + off_q, gain_w * w + off_w
+    e_q = array(mrp_error(Vec3(*y_q), p.q_d))
+    u = -p.k_q * e_q - p.k_w0 * (y_w - w_d)  # eq. (10)
+    turning = np.cross(w_hat, believed @ y_w)
+    w_hat_rate = np.linalg.solve(believed, -turning + p.beta * (y_w - w_hat) + G(y_q).T @ (y_q - q_hat) + u)
+    got = op.flow(p, op.scenario._replace(J=mat3(J)), 0.0, x, z)
+    np.testing.assert_allclose(array(got.q), G(q) @ w, rtol=1e-12)
+    np.testing.assert_allclose(array(got.w), np.linalg.solve(J, -np.cross(w, J @ w) + u), rtol=1e-12)
+    np.testing.assert_allclose(array(got.estimate.q), G(y_q) @ w_hat + p.alpha * (y_q - q_hat), rtol=1e-12)  # eq. (7)
+    np.testing.assert_allclose(array(got.estimate.w), w_hat_rate, rtol=1e-12)
+
+
+def test_every_reading_has_noise_of_its_own():
+    scenario = QUIET._replace(std_q=0.1, std_w=0.2)
+    x, z = op.init(op.params, scenario)
+    noise = np.arange(1.0, 7.0)
+    held = op.sense(op.params, scenario, Now(jnp.asarray(3), jnp.asarray(3.0), 1.0), x, z, jnp.asarray(noise))
+    np.testing.assert_allclose(array(held.y.q), array(scenario.q) + 0.1 * noise[:3], rtol=1e-12)
+    np.testing.assert_allclose(array(held.y.w), array(scenario.w) + 0.2 * noise[3:], rtol=1e-12)
 
 
 @pytest.mark.parametrize(("sign", "drift"), [(-1, 5.9e-12), (1, 0.948)])

@@ -377,15 +377,16 @@ def test_the_torque_is_pd_about_the_target_in_the_orbit_frame():
 
 
 def test_every_reading_has_noise_of_its_own():
-    s = healthy._replace(std_gyro=1e-3, std_star=1e-3, walk=1e-3, bias=Vec3(0.1, -0.2, 0.3))
+    bias = np.array([0.1, -0.2, 0.3])
+    s = healthy._replace(std_gyro=1e-3, std_star=1e-3, walk=1e-3, bias=Vec3(*bias))
     x, z = star.init(star.LMMSE, 1, params, s)
     read = lambda noise: star.sense(params, s, jaxatt.Now(0, 0.0, DT), x, z, jnp.asarray(noise))
     loud, quiet = read(np.arange(1.0, 13.0)), read(np.zeros(12))
     q = np.array(s.q)
     for star_, shown in zip(np.eye(3), rows(quiet.readings.stars)):  # eq. (6)
         np.testing.assert_allclose(shown, (left(q * [1, -1, -1, -1]) @ right(q) @ np.r_[0, star_])[1:], atol=1e-12)
-    np.testing.assert_allclose(rows(quiet.readings.gyro), np.array(s.w) + [0.1, -0.2, 0.3], rtol=1e-12)  # eq. (4)
-    np.testing.assert_allclose(rows(quiet.bias), [0.1, -0.2, 0.3], rtol=1e-12)
+    np.testing.assert_allclose(rows(quiet.readings.gyro), np.array(s.w) + bias, rtol=1e-12)  # eq. (4)
+    np.testing.assert_allclose(rows(quiet.bias), bias, rtol=1e-12)
     off = jax.tree.map(lambda a, b: np.asarray(a - b), loud, quiet)
     np.testing.assert_allclose(rows(off.readings.gyro), [1e-3, 2e-3, 3e-3], rtol=1e-9)
     np.testing.assert_allclose(rows(off.bias), 1e-3 * DT**0.5 * np.array([4.0, 5.0, 6.0]), rtol=1e-9)
