@@ -56,6 +56,7 @@ def test_the_spacecraft_starts_off_its_pointing_by_what_the_reference_says():
     np.testing.assert_allclose(np.array(q[1:]) * 2 / DEG, [0.10, -0.08, 0.12], rtol=1e-5)
     relative = w + Vec3(0.0, scenario.orbit_rate, 0.0)
     np.testing.assert_allclose(np.array(relative) / DEG, [2e-3, -1e-3, 1.5e-3], rtol=1e-9)
+    assert scenario.torque == (2e-4, -1e-4, 1.5e-4)
 
 
 # the filter in plain matrices
@@ -341,11 +342,16 @@ def test_the_plant_is_eulers_equation_with_gravity_gradient():
     np.testing.assert_allclose(moved.q, 0.5 * (right(np.r_[0, w]) - left([0, 0, -rate, 0])) @ q, rtol=1e-12)  # eq. (2)
 
 
-def test_feedback_from_a_filter_is_ideal_feedback_at_what_it_believes():
+@pytest.mark.parametrize("generator", [star.LMMSE, star.WITH_BIAS, star.TURN])
+def test_feedback_from_a_filter_is_ideal_feedback_at_what_it_believes(generator):
     rng = np.random.default_rng(6)
-    generator, (_, z) = star.WITH_BIAS, star.system_of(star.WITH_BIAS).init(params, scenario)
+    _, z = star.init(generator, 1, params, scenario)
     x = rng.normal(size=(7, 2))
-    filters = z.board.filters._replace(x=lmmse.AttitudeBias(*x))
+    if generator is star.WITH_BIAS:
+        filters = z.board.filters._replace(x=lmmse.AttitudeBias(*x))
+    else:  # unit quaternions, no bias
+        x = np.concatenate([x[:4] / np.linalg.norm(x[:4], axis=0), np.zeros((3, 2))])
+        filters = z.board.filters._replace(x=Quat(*x[:4]))
     readings = z.sensors.readings._replace(gyro=Vec3(*rng.normal(size=3)))
     for i in (ROLL, PITCH):
         q = x[:4, i] / np.linalg.norm(x[:4, i])
@@ -355,6 +361,13 @@ def test_feedback_from_a_filter_is_ideal_feedback_at_what_it_believes():
             for feedback, y in ((i + 1, readings), (0, believed))
         )
         np.testing.assert_allclose(got, expected, rtol=1e-12)
+        near = np.r_[1, 1e-6 * rng.normal(size=3)]  # where all three mean the same by an error
+        one = jax.tree.map(lambda a, i=i: a[i], filters)
+        one = one._replace(x=lmmse.AttitudeBias(*near, 0.0, 0.0, 0.0) if generator is star.WITH_BIAS else Quat(*near))
+        error, std, nees, _ = generator.error(one, Quat(1.0, 0.0, 0.0, 0.0))
+        np.testing.assert_allclose(error, 2 * near[1:], rtol=1e-9)
+        np.testing.assert_allclose(std, 2 * params.std_qv)
+        np.testing.assert_allclose(nees, np.sum(near[1:] ** 2) / params.std_qv**2, rtol=1e-9)
 
 
 def test_the_torque_is_pd_about_the_target_in_the_orbit_frame():
@@ -460,8 +473,9 @@ def test_a_step_must_be_positive(dt):
         star.system_of(window=0)
 
 
-def test_pointing_beyond_the_linear_range_warns_with_the_number():
-    off = Quat(np.cos(0.6 * DEG), np.sin(0.6 * DEG), 0.0, 0.0)
+@pytest.mark.parametrize("axis", np.eye(3))
+def test_pointing_beyond_the_linear_range_warns_with_the_number(axis):
+    off = Quat(np.cos(0.6 * DEG), *(np.sin(0.6 * DEG) * axis))
     with pytest.warns(UserWarning, match=r"`scenario.q` lies 1.2 deg from the orbit frame, beyond the 0.5 deg"):
         star.system.check(params, scenario._replace(q=off))
     with warnings.catch_warnings():

@@ -11,11 +11,13 @@ import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 import pytest  # noqa: E402
 from made_up import tallied  # noqa: E402
+from scipy.stats import norm  # noqa: E402
 
 import jaxatt  # noqa: E402
 from jaxatt import scores  # noqa: E402
 from jaxatt.bodies import Wheel, beyond, gated, wheel_acceleration  # noqa: E402
 from jaxatt.controllers import Adaptation, Mrac, mrac_flow, mrac_input, mrac_sampled_bound, mrac_step  # noqa: E402
+from jaxatt.engine import Now  # noqa: E402
 from jaxatt.estimators import LeastSquares, least_squares  # noqa: E402
 from jaxatt.faults import Fault  # noqa: E402
 from jaxatt.study import batch, varied  # noqa: E402
@@ -630,6 +632,32 @@ def test_sensors():
     np.testing.assert_allclose(read[:, 2], 64 * np.round(read[:, 2] / 64), atol=1e-9)
     np.testing.assert_array_less(np.abs(read - log.y)[:, 2], 32.0001)
     np.testing.assert_allclose((read - log.y)[:, 3], 20 * normals, atol=1e-9)
+
+
+@pytest.mark.parametrize("uniform, unit", [(0.0, 0.3), (1.0, 2 * norm.cdf(0.3) - 1)])
+def test_one_tick_draws_and_holds_what_the_channels_say(uniform, unit):
+    noise, last = jnp.array([0.3, -0.7, 1.1]), 100.0 + np.arange(wm.DELAYS + 1)
+    day = wm.scenario._replace(
+        uniform=uniform, tacho_noise=2.0, delay=0.06, wheel=wm.scenario.wheel._replace(friction=10.0),
+        drive=Fault(onset=0.5, random=3.0, scale=0.8), friction=Fault(onset=0.5, bias=30.0, scale=0.5),
+    )  # fmt: skip
+    x, z = wm.init(wm.params, day)
+    x = x._replace(theta=jnp.asarray(5.0), y=jnp.asarray(7.0))
+    readings = wm.Readings(jnp.asarray(99.0), jnp.asarray(55.0))
+    assert z.sensors.line.shape == last.shape
+    z = z._replace(sensors=z.sensors._replace(line=jnp.asarray(last), readings=readings))
+    now = Now(jnp.asarray(50), jnp.asarray(1.0), wm.DT)
+    _, after, _ = wm.tick(wm.params, day, now, x, z, noise)
+    np.testing.assert_allclose(after.sensors.line, [5 + 0.05 * unit, *last[:-1]], rtol=1e-12)
+    np.testing.assert_allclose(after.sensors.readings, [last[2], 7 - 2 * 0.7], rtol=1e-12)  # three ticks ago
+    np.testing.assert_allclose(after.drive, [0.8, 3 * 1.1], rtol=1e-12)
+    np.testing.assert_allclose(after.friction, 0.5 * 10 + 30, rtol=1e-12)
+    stuck = Fault(onset=0.5, stuck=1.0)
+    day = day._replace(delay=wm.DELAYS * wm.DT, attitude=stuck, tacho=stuck, drive=stuck)
+    _, after, _ = wm.tick(wm.params, day, now, x, z._replace(board=z.board._replace(u=jnp.asarray(44.0))), noise)
+    np.testing.assert_allclose(after.sensors.line[0], last[0])
+    np.testing.assert_allclose(after.sensors.readings, [last[-2], 55.0])  # as late as can be
+    np.testing.assert_allclose(after.drive, [0.0, 44.0])
 
 
 def test_on_board_code_gets_no_truth():
