@@ -289,6 +289,7 @@ def test_loop_agrees_with_the_oracle(params, scenario, sampled):
     system = wm.loop(sampled=sampled, substeps=5)
     log = jaxatt.simulate(system, params, scenario, wm.normals_of(v, 0.05), ticks=ticks)
     ours = np.stack([log.theta, log.y, log.a_r, log.a_y, log.r, -params.J_w / log.J_hat, log.P], axis=1)
+    np.testing.assert_allclose(log.step, np.diff(log.r, prepend=log.r[0]), atol=1e-9)
     theirs = oracle(params, scenario, v, ticks, 5, sampled)
     scale = np.abs(theirs).max(0)
     np.testing.assert_allclose(ours / scale, theirs / scale, atol=1e-10)
@@ -658,6 +659,8 @@ def test_one_tick_draws_and_holds_what_the_channels_say(uniform, unit):
     np.testing.assert_allclose(after.sensors.line[0], last[0])
     np.testing.assert_allclose(after.sensors.readings, [last[-2], 55.0])  # as late as can be
     np.testing.assert_allclose(after.drive, [0.0, 44.0])
+    for rounded in (1, 1 + 1e-12):
+        assert wm.system.check(wm.params, day._replace(delay=rounded * wm.DELAYS * wm.DT)) == ()
 
 
 def test_on_board_code_gets_no_truth():
