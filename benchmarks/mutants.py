@@ -71,6 +71,8 @@ def _spared(tree: ast.Module) -> set[int]:
             words.append(node)
         if _lends_its_shape(node):
             words += node.args  # pyright: ignore[reportAttributeAccessIssue]
+        if isinstance(node, ast.Attribute) and node.attr == "shape":
+            words.append(node.value)
         if isinstance(node, ast.BinOp) and (_lends_its_shape(node.left) or _lends_its_shape(node.right)):
             spared.add(id(node))
         for word in filter(None, words):

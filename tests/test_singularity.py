@@ -98,6 +98,8 @@ def test_rank_one_is_seen():
     assert kappa > 1e7 and rank_one
     kappa, rank_one = sg.condition_and_rank(Vec3(*np.eye(3)))
     assert kappa == 1 and not rank_one
+    kappa, rank_one = sg.condition_and_rank(Vec3(*np.diag([1.0, 1.0, 0.0])))
+    assert np.isinf(kappa) and not rank_one
 
 
 def test_condition_has_finite_gradients():
@@ -108,6 +110,8 @@ def test_condition_has_finite_gradients():
     for T in (np.eye(3), np.ones((3, 3)), np.zeros((3, 3)), np.diag([1.0, 1.0, 0.5])):
         gradient = jax.grad(lambda T: sum(sg.singular_values(Vec3(*T))))(jnp.asarray(T))
         assert np.isfinite(gradient).all()
+    flat = jax.grad(lambda T: jnp.sum(sg.condition(Vec3(*T))))(jnp.diag(jnp.array([1.0, 1.0, 0.0])))
+    assert np.isfinite(flat).all()
 
 
 COUNTS = {72: (9168, 22720), 120: (40976, 77312), 180: (137152, 229744), 360: (1104912, 2161632)}
