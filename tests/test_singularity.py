@@ -209,6 +209,20 @@ def test_holes_of_the_box_are_discs():
     assert np.isnan(sg.singular_momentum(THREE["box"], Vec3(*np.eye(3)[:, :1]), np.ones(3))[0].x).all()
 
 
+def test_the_rims_of_the_pyramid_are_singular():
+    """Close to a gimbal axis its own module spins in any direction across it, the others point along it as far as they can."""
+    axes, rng = THREE["pyramid"], np.random.default_rng(3)
+    r = np.stack(axes.r, axis=-1)
+    for i, u in enumerate(r):
+        for signs in ((1, 1), (1, -1), (-1, -1)):
+            across = np.cross(u, rng.normal(size=3))
+            h = across / np.linalg.norm(across)
+            for sign, other in zip(signs, np.delete(r, i, axis=0)):
+                s = u - (u @ other) * other
+                h = h + sign * s / np.linalg.norm(s)
+            assert sg.clearance(axes, h) < 1e-9
+
+
 @pytest.mark.parametrize(
     ("momentum", "distance"), [((0.9, 0.5, 0), 0.1), ((1.1, -1, 1), 0.1), ((1, 1, 0.5), 0), ((1, 2.3, 0), 0.3)]
 )
@@ -224,12 +238,12 @@ def test_clearance_of_zero_momentum():
 
 
 def test_far_outside_the_nearest_singular_momentum_is_the_envelopes():
-    """The flat discs of the rims end where the envelope ends."""
-    box = FOUR["box"]
-    for far in np.eye(3):
-        reached = float(sg.support(box, Vec3(*far[:, None]))[0])
-        near = sg.clearance(box, 100 * far)
-        assert 100 - reached - 1e-6 <= near <= np.hypot(100 - reached, 4)
+    """The flat discs of the rims end where the envelope ends, and circles too."""
+    for axes in (FOUR["box"], THREE["box"], THREE["pyramid"]):
+        for far in np.eye(3):
+            reached = float(sg.support(axes, Vec3(*far[:, None]))[0])
+            near = sg.clearance(axes, 100 * far)
+            assert 100 - reached - 1e-6 <= near <= np.hypot(100 - reached, 4)
 
 
 REACH = {
