@@ -71,7 +71,7 @@ def _spared(tree: ast.Module) -> set[int]:
             words.append(node)
         if _lends_its_shape(node):
             words += node.args  # pyright: ignore[reportAttributeAccessIssue]
-        if isinstance(node, ast.Attribute) and node.attr == "shape":
+        if isinstance(node, ast.Attribute) and node.attr in ("shape", "dtype"):
             words.append(node.value)
         if isinstance(node, ast.BinOp) and (_lends_its_shape(node.left) or _lends_its_shape(node.right)):
             spared.add(id(node))

@@ -433,11 +433,10 @@ def _area(axes: GimbalAxes, m: int):
         (s_i, t_i), (s_j, t_j) = at(i, midpoints[:, None]), at(j, midpoints[None] + np.pi / (2 * m))
         across = cross(t_i, t_j)
         root = jnp.arctan2(across @ cross(r[k], s0[k]), across @ s0[k])
-        for half_turn in (0, jnp.pi):
-            s_k, t_k = at(k, root + half_turn)
-            slope = jnp.abs(across @ s_k)  # dt/dgamma = -s
-            gradient = safe_sqrt(slope**2 + (t_k @ cross(s_i, t_j)) ** 2 + (t_k @ cross(t_i, s_j)) ** 2)
-            total += jnp.mean(slope / jnp.where(gradient > 0, gradient, 1))
+        s_k, t_k = at(k, root)  # half a turn on, where the other root is, both change their sign
+        slope = jnp.abs(across @ s_k)  # dt/dgamma = -s
+        gradient = safe_sqrt(slope**2 + (t_k @ cross(s_i, t_j)) ** 2 + (t_k @ cross(t_i, s_j)) ** 2)
+        total += 2 * jnp.mean(slope / jnp.where(gradient > 0, gradient, 1))
     return total
 
 
