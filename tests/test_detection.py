@@ -36,7 +36,7 @@ def test_thresholds_are_those_of_the_table():
 
 
 def test_the_quantile_is_that_of_scipy():
-    p, dof = np.meshgrid([0.5, 1e-2, 1e-5, 1e-9], [1, 2, 3, 30, 300])
+    p, dof = np.meshgrid([0.5, 1e-2, 1e-5, 1e-9, 1e-100, 1e-290], [0.1, 1, 2, 3, 30, 300, 1e5])
     np.testing.assert_allclose(detection.threshold_quantile(p, dof), stats.chi2.isf(p, dof), rtol=1e-9)
 
 
