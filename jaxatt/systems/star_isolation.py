@@ -337,6 +337,7 @@ def decide(params: Params, now, board: Board, readings: Readings, generator: Gen
     lengths = norm(readings.stars)
     pointing = readings.stars / jnp.where(lengths > 0, lengths, 1)
     y = Vec3(*(jnp.where(params.unit > 0, a, b) for a, b in zip(pointing, readings.stars)))
+    # jit, so that it is traced once for its shapes and its values
     step = jax.jit(lambda: advanced(generator, params, board.filters, board.gyro, y, now.dt), inline=True)
     start = lambda: (board.filters, jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(step)[1]))
     filters, innovation = jax.lax.cond(now.k > 0, step, start)
