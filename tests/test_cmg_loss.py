@@ -294,25 +294,26 @@ def test_the_gyro_reads_rate_bias_and_noise():
 
 def test_one_tick_is_the_equations_in_plain_numbers():
     rng = np.random.default_rng(8)
-    day = cmg.lost(P, (10, 55, 45, -10), module=1, brake=2e-3, free=1.0)._replace(u_max=0.3, tau_g=0.2)
+    day = cmg.lost(P, (10, 55, 45, -10), module=1, brake=2e-3, free=1.0)._replace(u_max=0.3, tau_g=0.2, module=INERTIA)
+    believed = ModuleInertia(6e-4, 1.2e-3, 4e-4, 1.1e-3)
+    p = cmg.params._replace(module=believed)
     healthy = np.array([1.0, 0, 1, 1])
     q, w, integral = rng.normal(size=4), 2e-4 * rng.normal(size=3), 2e-4 * rng.normal(size=3)
     (rate, before), u_before = rng.normal(size=(2, 4)), np.array([-0.2, 0.0, 0.28, 0.1])
     q /= np.linalg.norm(q)
-    x, z = cmg.init(cmg.params, day)
+    x, z = cmg.init(p, day)
     x = x._replace(q=Quat(*(2 * q)), w=Vec3(*w), rate=jnp.asarray(rate))
     board, drive = z.board._replace(integral=Vec3(*integral)), z.drive._replace(u=jnp.asarray(u_before))
     z = z._replace(rate=jnp.asarray(before), board=board, drive=drive)
-    tick = lambda k: cmg.tick(cmg.params, day, Now(jnp.asarray(k), jnp.asarray(k * cmg.DT), cmg.DT), x, z, jnp.zeros(3))
+    tick = lambda k: cmg.tick(p, day, Now(jnp.asarray(k), jnp.asarray(k * cmg.DT), cmg.DT), x, z, jnp.zeros(3))
     moved, after, log = tick(20)
 
-    m, at = cmg.MODULE, cmg_triads(day.axes, day.gamma)
+    at = cmg_triads(day.axes, day.gamma)
     r, s, T = (np.stack([np.asarray(c) for c in v]) for v in at)
-    J_T = (
-        np.stack([np.array(row) for row in day.J]) + m.I_cr * r @ r.T + m.I_cs * s @ s.T + m.I_ct * T @ T.T
-    )  # eq. (11)
+    J_S = np.stack([np.array(row) for row in day.J])
+    J_T = lambda m: J_S + m.I_cr * r @ r.T + m.I_cs * s @ s.T + m.I_ct * T @ T.T  # eq. (11)
     integral = integral - 0.1 * w
-    a = -J_T @ (-0.2 * w + 0.02 * integral) / (m.I_ws * 600)  # eq. (7)
+    a = -J_T(believed) @ (-0.2 * w + 0.02 * integral) / (believed.I_ws * 600)  # eq. (7)
     wanted = np.linalg.pinv(T * healthy) @ a
     u = healthy * np.clip(wanted, -0.3, 0.3)
     np.testing.assert_allclose(array(after.board.integral), integral, rtol=1e-12)
@@ -329,7 +330,7 @@ def test_one_tick_is_the_equations_in_plain_numbers():
     np.testing.assert_allclose(log.acceleration, healthy @ ((u - rate) / 0.2) ** 2 / 3, rtol=1e-9)
     sizes = np.linalg.svd(T * healthy, compute_uv=False)
     np.testing.assert_allclose(log.condition, sizes[0] / sizes[2], rtol=1e-9)
-    h = J_T @ w + m.I_cr * r @ rate + m.I_ws * 600 * s.sum(1)
+    h = J_T(INERTIA) @ w + INERTIA.I_cr * r @ rate + INERTIA.I_ws * 600 * s.sum(1)
     np.testing.assert_allclose(array(log.momentum), array(quat_rotate(Quat(*q), Vec3(*h))), rtol=1e-12)
     between = tick(21)[1].board  # no control sample
     np.testing.assert_array_equal(between.u, z.board.u)
