@@ -58,7 +58,7 @@ class Mutant(NamedTuple):
 
 
 def _spared(tree: ast.Module) -> set[int]:
-    """Nodes that are no physics: annotations, what words are made of, and what only lends its shape."""
+    """Nodes that are no physics: annotations, what words are made of, and what only lends its shape or type."""
     spared: set[int] = set()
     for node in ast.walk(tree):
         words = [getattr(node, "annotation", None), getattr(node, "returns", None)]

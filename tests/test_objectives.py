@@ -117,6 +117,10 @@ def test_the_margins_of_the_papers_proof():
     least = 330 - np.sqrt(330**2 - 2)  # root of k_q = eps / 2 + 1 / eps, eq. (18)
     assert least == pytest.approx(0.00303032, abs=5e-9)
     assert op.margins(op.params._replace(eps=least), largest).k_q == pytest.approx(0, abs=1e-7)
+    h = 0.7 * largest / 4 * (3 + 2 * q + 3 * q * q) + 1.5  # the floor of the rate gain; here eps^2 / 2 counts
+    c = 0.7 * largest * w + 1 + q * q
+    T = op.margins(op.params._replace(eps=0.7, k_w0=200.0), largest, q, w).T
+    assert pytest.approx(0.7 * op.params.k_q - 0.7**2 / 2 - 1 - c * c / (200 - h), rel=1e-9) == T
     low = op.margins(op.params._replace(k_w0=1.0), largest, q, w)
     assert low.T < 0
     gradient = jax.grad(lambda k: op.margins(op.params._replace(k_w0=k), largest, q, w).T)
