@@ -310,8 +310,7 @@ def test_one_tick_is_the_equations_in_plain_numbers():
 
     at = cmg_triads(day.axes, day.gamma)
     r, s, T = (np.stack([np.asarray(c) for c in v]) for v in at)
-    J_S = np.stack([np.array(row) for row in day.J])
-    J_T = lambda m: J_S + m.I_cr * r @ r.T + m.I_cs * s @ s.T + m.I_ct * T @ T.T  # eq. (11)
+    J_T = lambda m: array(day.J) + m.I_cr * r @ r.T + m.I_cs * s @ s.T + m.I_ct * T @ T.T  # eq. (11)
     integral = integral - 0.1 * w
     a = -J_T(believed) @ (-0.2 * w + 0.02 * integral) / (believed.I_ws * 600)  # eq. (7)
     wanted = np.linalg.pinv(T * healthy) @ a

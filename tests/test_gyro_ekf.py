@@ -1,9 +1,9 @@
-"""The gyro loop: mounting, Kalman core, linear analysis, and what the reference says the closed loop does."""
+"""The gyro loop: mounting, Kalman core, growth rates, and what the reference says the closed loop does."""
 
 import inspect
 import warnings
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ import jaxatt
 from jaxatt import detection
 from jaxatt.attitude import euler_rate, quat_from_euler, quat_rotate
 from jaxatt.controllers import allocation
-from jaxatt.engine import Now, System, admit
+from jaxatt.engine import Now, admit
 from jaxatt.faults import Fault, Reading
 from jaxatt.kalman import Belief, ekf_predict, innovation, kalman_update, nees
 from jaxatt.linear import growth_rates, observability_rank, sampled
@@ -198,28 +198,6 @@ def test_model_jacobian_is_the_specs():
 
 
 # linear analysis
-
-
-class X(NamedTuple):
-    pos: jax.Array
-    vel: jax.Array
-
-
-def test_growth_rates_of_a_known_loop():
-    """x'' = -x - 0.2 x': growth rate -0.1, but for the RK4 step's own error."""
-    flow = lambda p, s, t, x, z: X(x.vel, -x.pos - 0.2 * x.vel)
-    loop = System(lambda p, s: (X(s, s), ()), lambda p, s, now, x, z, n: (x, z, None), flow, dt=0.01)
-    M = sampled(loop, 1.0, 1.0, ticks=5)
-    np.testing.assert_allclose(growth_rates(M, 0.05), [-0.1, -0.1], atol=1e-9)
-    assert sampled(loop, 1.0, 1.0, ticks=1, states=("pos",)).shape == (1, 1)
-    with pytest.raises(ValueError, match="`states` must be a tuple of"):
-        sampled(loop, 1.0, 1.0, ticks=1, states=("spin",))
-
-
-def test_observability_of_a_double_integrator():
-    A = np.array([[0, 1, 0], [0, 0, 0], [0, 0, 0.0]])
-    assert observability_rank(A, np.array([[1.0, 0, 0]]), np.ones(3), duration=10.0) == 2
-    assert observability_rank(A, np.array([[0.0, 1, 0]]), np.ones(3), duration=10.0) == 1
 
 
 @pytest.mark.parametrize("told, expected", [(0.0, ZERO), (1.0, PINV)])

@@ -18,7 +18,7 @@ from jaxatt.replay import replay  # noqa: E402
 from jaxatt.study import batch  # noqa: E402
 from jaxatt.systems import star_isolation as star  # noqa: E402
 from jaxatt.systems.star_isolation import ARCSEC, DEG, HEALTHY, PITCH, ROLL, params, scenario  # noqa: E402
-from jaxatt.vec import mat3  # noqa: E402
+from jaxatt.vec import array, mat3  # noqa: E402
 
 KEY = jax.random.key(1)
 TICKS = 3000
@@ -70,6 +70,11 @@ def left(p):
 def right(q):
     w, x, y, z = q
     return np.array([[w, -x, -y, -z], [x, w, z, -y], [y, -z, w, x], [z, y, -x, w]])
+
+
+def in_body(q, v):
+    """A(q) v: a vector of the orbit frame in body axes."""
+    return (left(q * [1, -1, -1, -1]) @ right(q) @ [0, *v])[1:]
 
 
 def skew(v):
@@ -336,7 +341,7 @@ def test_the_plant_is_eulers_equation_with_gravity_gradient():
     day = scenario._replace(q=Quat(*q), w=Vec3(*w), J=mat3(J), orbit_rate=rate, torque=Vec3(*outside))
     x, z = star.system.init(params, day)
     moved = star.system.flow(params, day, 0.0, x, z._replace(torque=Vec3(*wheels)))
-    down = (left(q * [1, -1, -1, -1]) @ right(q) @ [0, 0, 0, 1])[1:]
+    down = in_body(q, [0, 0, 1])
     torque = wheels + outside + 3 * rate**2 * np.cross(down, J @ down) - np.cross(w, J @ w)
     np.testing.assert_allclose(moved.w, np.linalg.solve(J, torque), rtol=1e-9)
     np.testing.assert_allclose(moved.q, 0.5 * (right(np.r_[0, w]) - left([0, 0, -rate, 0])) @ q, rtol=1e-12)  # eq. (2)
@@ -377,9 +382,9 @@ def test_the_torque_is_pd_about_the_target_in_the_orbit_frame():
     p = params._replace(q_d=Quat(*target), orbit_rate=0.2, bandwidth=0.3, damping=0.7, u_max=np.inf)
     _, z = star.init(star.LMMSE, 1, p, scenario)
     readings = z.sensors.readings._replace(q=Quat(*q), w=Vec3(*w))
-    J = np.stack([np.array(row) for row in p.J])
+    J = array(p.J)
     e = left(target * [1, -1, -1, -1]) @ q
-    orbit = (left(q * [1, -1, -1, -1]) @ right(q) @ [0, 0, -0.2, 0])[1:]
+    orbit = in_body(q, [0, -0.2, 0])
     u = np.cross(w, J @ w) - J @ (2 * 0.3**2 * np.sign(e[0]) * e[1:] + 2 * 0.7 * 0.3 * (w - orbit))
     np.testing.assert_allclose(star.command(star.LMMSE, p, z.board.filters, readings), u, rtol=1e-12)
     limited = star.command(star.LMMSE, p._replace(u_max=1.0), z.board.filters, readings)
@@ -397,7 +402,7 @@ def test_every_reading_has_noise_of_its_own():
     loud, quiet = read(np.arange(1.0, 13.0)), read(np.zeros(12))
     q = np.array(s.q)
     for star_, shown in zip(np.eye(3), rows(quiet.readings.stars)):  # eq. (6)
-        np.testing.assert_allclose(shown, (left(q * [1, -1, -1, -1]) @ right(q) @ np.r_[0, star_])[1:], atol=1e-12)
+        np.testing.assert_allclose(shown, in_body(q, star_), atol=1e-12)
     np.testing.assert_allclose(rows(quiet.readings.gyro), np.array(s.w) + bias, rtol=1e-12)  # eq. (4)
     np.testing.assert_allclose(rows(quiet.bias), bias, rtol=1e-12)
     off = jax.tree.map(lambda a, b: np.asarray(a - b), loud, quiet)
