@@ -22,7 +22,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("results/benchmarks.json"), help="table as JSON")
     args = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    jaxatt.fast_cpu()
+    jaxatt.configure()
     rows = []
     for name in args.names or NAMES:
         print(f"\n{name} (Python {platform.python_version()}, JAX {jax.__version__})")

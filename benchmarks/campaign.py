@@ -51,7 +51,7 @@ import resource, sys, jax
 jax.config.update("jax_enable_x64", True)
 from experiments.campaigns import campaign
 from jaxatt.campaign import run
-from jaxatt.summary import describe
+from jaxatt.campaign.summary import describe
 some = campaign("observer_pd", 1)._replace(ticks=20)
 describe(run(sys.argv[1], some, int(sys.argv[2]), progress=False))
 print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)

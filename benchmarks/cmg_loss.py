@@ -12,10 +12,10 @@ import numpy as np
 from benchmarks.measure import c_library, cpu_ns, seconds
 from jaxatt import simulate, sweep
 from jaxatt import singularity as sg
-from jaxatt.mounting import cmg_triads, modules
-from jaxatt.systems import cmg_loss as cmg
+from jaxatt.cmg import cmg_triads, modules
+from jaxatt.loops import cmg_loss as cmg
 
-COUNTS = {"pyramid": (cmg.PYRAMID, 8808256), "box-90": (cmg.BOX, 16346560)}  # at 0.5 deg
+COUNTS = {"pyramid": (cmg.PYRAMID, 8808256), "box-90": (cmg.BOX, 16346560)}  # mounting of four, count of three, 0.5 deg
 
 
 def rows(quick: bool) -> Iterator[dict]:
@@ -28,8 +28,8 @@ def grid() -> Iterator[dict]:
     library = c_library(Path(__file__).with_suffix(".c"), "double")
     library.ill_conditioned.restype = ctypes.c_long
     whole = 0.0
-    for name, (skew, exact) in COUNTS.items():
-        axes = modules(cmg.lost(skew, np.zeros(4)).axes, [0, 1, 2])
+    for name, (four, exact) in COUNTS.items():
+        axes = modules(four, [0, 1, 2])
         at = jax.tree.map(lambda a: a[:, None], axes)
         table = np.stack([np.asarray(c) for c in cmg_triads(at, np.radians(0.5) * np.arange(360)).t], axis=1)
         table = np.ascontiguousarray(table)  # (module, xyz, angle)
@@ -56,7 +56,7 @@ def grid() -> Iterator[dict]:
 
 def loop(quick: bool) -> Iterator[dict]:
     ticks = 100 if quick else 400
-    batch = jax.tree.map(lambda a: np.repeat(np.asarray(a, float)[..., None], 1024, axis=-1), cmg.scenario)
+    batch = jax.tree.map(lambda a: np.broadcast_to(np.asarray(a, float), (1024, *np.shape(a))), cmg.scenario)
     key = jax.random.key(0)
     for substeps, step in ((10, "1 ms"), (1, "10 ms")):
         system = cmg.system._replace(substeps=substeps)
@@ -68,10 +68,10 @@ def loop(quick: bool) -> Iterator[dict]:
         yield {"name": f"loop, N = 1024, float64, plant step {step}", "value": ns, "unit": "ns per scenario-step"}
 
     def cost(params):
-        log = simulate(system, params, batch_128, jax.random.split(key, 128), ticks=100)
+        log = jax.vmap(lambda s: simulate(system, params, s, key, ticks=100))(batch_128)
         return (log.w @ log.w).sum()
 
-    batch_128 = jax.tree.map(lambda a: a[..., :128], batch)
+    batch_128 = jax.tree.map(lambda a: a[:128], batch)
     forward, gradient = jax.jit(cost), jax.jit(jax.grad(cost))
     f, g = cpu_ns(lambda: forward(cmg.params), 128 * 100, 3), cpu_ns(lambda: gradient(cmg.params), 128 * 100, 3)
     yield {"name": "gradient in all params / run, N = 128, plant step 10 ms", "value": g / f, "unit": ""}

@@ -12,38 +12,47 @@ import numpy as np
 
 import jaxatt
 from benchmarks.measure import c_library, cpu_ns
-from jaxatt.engine import rk4
+from jaxatt.engine import over_lanes, rk4
 from jaxatt.faults import Reading
-from jaxatt.kalman import Belief, ekf_predict, kalman_update
-from jaxatt.mounting import along, gyro_pyramid, wheel_pyramid
-from jaxatt.study import batch
-from jaxatt.systems import gyro_ekf
-from jaxatt.vec import array, inverse, vec3
+from jaxatt.filters import Belief, predict, update
+from jaxatt.loops import gyro_ekf
+from jaxatt.noise import BLOCK
+from jaxatt.sensors import gyro_pyramid
+from jaxatt.vec import Vec3, array, inverse, project
+from jaxatt.wheels import wheel_pyramid
 
-BLOCK = 128
 LANES = 1024
 
 
 def start(real):
-    """A filter under way for 1024 scenarios, and what it reads: mean, cov, u, y, lanes last."""
+    """Filters under way for 1024 scenarios, and what they read: mean, cov, u, y, the scenarios last, as in C."""
     rng = np.random.default_rng(0)
-    mean = (rng.normal(size=(17, LANES)) * np.repeat([1.0, 1e-3, 1e-3, 10.0, 1e-4], [3, 3, 3, 4, 4])[:, None]).astype(
-        real
-    )
+    size = np.repeat([1.0, 1e-3, 1e-3, 10.0, 1e-4], [3, 3, 3, 4, 4])
+    mean = (rng.normal(size=(17, LANES)) * size[:, None]).astype(real)
     cov = np.broadcast_to(np.eye(17)[..., None], (17, 17, LANES)).astype(real)
     u = rng.normal(size=(4, LANES)).astype(real)
-    y = np.asarray(gyro_ekf.measured(gyro_ekf.params, jnp.asarray(mean)), real)
-    return mean, cov.copy(), u, y
+    y = over_lanes(expected, LANES)(jnp.asarray(mean))
+    return mean, cov.copy(), u, np.asarray(y, real)
+
+
+def expected(x, params=gyro_ekf.params):
+    """What the sensors read of the state x (17,), in a row (11,)."""
+    return jnp.concatenate([jnp.stack(list(a)) for a in gyro_ekf.measured(params, x)])
+
+
+def rates(params, u, x):
+    """dx/dt (17,) of the filter's state under the command u (4,)."""
+    return jnp.concatenate([*map(array, gyro_ekf.drift(params, u, x)), u, jnp.zeros(4, x.dtype)])
 
 
 def jax_run(tick, ticks: int):
-    """The tick in a scan, in blocks of 128 lanes as the engine runs it."""
+    """The tick (belief, u, y) -> belief of one scenario in a scan, in blocks of 128 scenarios as the engine runs it."""
 
     @jax.jit
     def run(mean, cov, u, y):
         def block(operands):
             mean, cov, u, y = operands
-            step = lambda belief, _: (tick(belief, u, y), None)
+            step = lambda belief, _: (over_lanes(tick, BLOCK)(belief, u, y), None)
             return jax.lax.scan(step, Belief(mean, cov), None, length=ticks)[0]
 
         split = lambda a: jnp.moveaxis(a.reshape(*a.shape[:-1], -1, BLOCK), -2, 0)
@@ -60,31 +69,24 @@ def typed(real):
 
 def ours(params, belief, u, y):
     """The library's tick."""
-    real = belief.mean.dtype
     unmoved = jnp.concatenate([u, jnp.zeros_like(u)])
-    belief = ekf_predict(belief, partial(gyro_ekf.drift, params, u), unmoved, params.Q, jnp.asarray(gyro_ekf.DT, real))
-    return kalman_update(belief, Reading(y, jnp.ones(y.shape, bool)), partial(gyro_ekf.measured, params), params.R)[0]
+    prior = predict(belief, partial(gyro_ekf.drift, params, u), unmoved, params.Q, gyro_ekf.DT)
+    return update(prior, Reading(y, jnp.ones(11, bool)), partial(gyro_ekf.measured, params), params.R)[0]
 
 
 def naive(params, belief, u, y):
-    """The textbook tick under vmap: jacfwd of the dynamics, dense products, Cholesky, lanes first within."""
+    """The textbook tick: jacfwd of the dynamics, dense products, Cholesky."""
 
-    def one(mean, cov, u, y):
-        def rate(x):
-            return jnp.concatenate([gyro_ekf.drift(params, u, x), u, jnp.zeros_like(u)])
+    def joint(t, belief):
+        A = jax.jacfwd(partial(rates, params, u))(belief.mean)
+        return Belief(rates(params, u, belief.mean), A @ belief.cov + belief.cov @ A.T + jnp.diag(params.Q))
 
-        def joint(t, belief):
-            A = jax.jacfwd(rate)(belief.mean)
-            return Belief(rate(belief.mean), A @ belief.cov + belief.cov @ A.T + jnp.diag(params.Q))
-
-        x, P = rk4(joint, 0.0, Belief(mean, cov), jnp.asarray(gyro_ekf.DT, mean.dtype))
-        h = partial(gyro_ekf.measured, params)
-        H = jax.jacfwd(h)(x)
-        S = jax.scipy.linalg.cho_factor(H @ P @ H.T + jnp.diag(params.R))
-        K = jax.scipy.linalg.cho_solve(S, H @ P).T
-        return Belief(x + K @ (y - h(x)), (jnp.eye(17, dtype=x.dtype) - K @ H) @ P)
-
-    return jax.vmap(one, in_axes=-1, out_axes=-1)(belief.mean, belief.cov, u, y)
+    x, P = rk4(joint, 0.0, belief, jnp.asarray(gyro_ekf.DT, y.dtype))
+    h = partial(expected, params=params)
+    H = jax.jacfwd(h)(x)
+    S = jax.scipy.linalg.cho_factor(H @ P @ H.T + jnp.diag(params.R))
+    K = jax.scipy.linalg.cho_solve(S, H @ P).T
+    return Belief(x + K @ (y - h(x)), (jnp.eye(17, dtype=x.dtype) - K @ H) @ P)
 
 
 def c_run(real, ticks: int):
@@ -92,7 +94,7 @@ def c_run(real, ticks: int):
     kind = "float" if real == np.float32 else "double"
     run = c_library(Path(__file__).with_suffix(".c"), kind).run
     p = gyro_ekf.params
-    axes = lambda a: np.asarray(along(a, vec3(jnp.eye(3))))  # (4, 3)
+    axes = lambda a: np.asarray(project(a, Vec3.of(jnp.eye(3))))  # (4, 3)
     G, W = axes(gyro_pyramid(p.alpha, p.beta)), axes(wheel_pyramid(p.gamma)).T
     J = np.array(p.J)
     model = np.concatenate([np.ravel(a) for a in (J, np.array(array(inverse(p.J))), G, W, p.Q, p.R, gyro_ekf.DT)])
@@ -113,27 +115,24 @@ def c_run(real, ticks: int):
 
 def discrete(params, belief, u, y):
     """An option beside the library's tick: F P F' + Q dt with F = I + A dt + (A dt)^2 / 2, the mean by RK4."""
-    dt = jnp.asarray(gyro_ekf.DT, belief.mean.dtype)
-    f = partial(gyro_ekf.drift, params, u)
-    rates = lambda t, x: jnp.concatenate([f(x), u, jnp.zeros_like(u)])
+    dt = jnp.asarray(gyro_ekf.DT, y.dtype)
+    f = partial(rates, params, u)
     _, A = jax.linearize(f, belief.mean)
 
     def moved(row):  # F row
         first = A(row)
-        ahead = jnp.pad(first, [(0, 8)] + [(0, 0)] * (first.ndim - 1))
-        return row.at[:9].add(dt * (first + dt / 2 * A(ahead)))
+        return row + dt * (first + dt / 2 * A(first))
 
     half = jax.lax.map(moved, belief.cov)
-    index = jnp.arange(17)
-    column = lambda r: moved(half[:, r]) + dt * jnp.where((index == r)[:, None], params.Q[:, None], 0)
-    prior = Belief(rk4(rates, 0.0, belief.mean, dt), jax.lax.map(column, index))
-    return kalman_update(prior, Reading(y, jnp.ones(y.shape, bool)), partial(gyro_ekf.measured, params), params.R)[0]
+    column = lambda r: moved(half[:, r]) + dt * jnp.where(jnp.arange(17) == r, params.Q, 0)
+    prior = Belief(rk4(lambda t, x: f(x), 0.0, belief.mean, dt), jax.lax.map(column, jnp.arange(17)))
+    return update(prior, Reading(y, jnp.ones(11, bool)), partial(gyro_ekf.measured, params), params.R)[0]
 
 
 def sweep_ns(loop, score, real, n: int, ticks: int) -> float:
     """CPU ns per scenario-tick of a whole closed loop in a sweep."""
     single, one = jax.tree.map(lambda a: np.asarray(a, real), (gyro_ekf.params, gyro_ekf.scenario))
-    scenarios = batch(one, n)
+    scenarios = jax.tree.map(lambda a: np.broadcast_to(a, (n, *a.shape)), one)
     key = jax.random.key(0)
     run = lambda: jaxatt.sweep(loop, single, scenarios, key, ticks=ticks, score=score, progress=False)
     return cpu_ns(run, n * ticks, 3)
@@ -174,5 +173,5 @@ def rows(quick: bool):
         n, length = (256, 200) if quick else (1024, 800)
         with_filter = sweep_ns(gyro_ekf.system, gyro_ekf.score, real, n, length)
         yield row(f"closed loop with filter, noise and tallies, {name}, N = {n}", with_filter)
-        without = sweep_ns(gyro_ekf.direct, gyro_ekf.score_loop, real, n, length)
+        without = sweep_ns(gyro_ekf.direct, gyro_ekf.score, real, n, length)
         yield row(f"closed loop without filter, {name}, N = {n}", without)

@@ -34,13 +34,15 @@ from tqdm import tqdm
 
 ROOT = Path(__file__).parents[1]
 PHYSICS = (
-    "attitude", "bodies", "controllers", "detection", "estimators", "faults", "kalman", "linear", "lmmse", "mounting", "sensors",
-    "singularity", "vec", "systems/cmg_loss", "systems/gyro_ekf", "systems/observer_pd", "systems/star_isolation",
-    "systems/wheel_mrac",
+    "attitude", "bodies", "cmg", "controllers", "delays", "detection", "faults", "filters", "linear", "observers", "sensors",
+    "singularity", "star_filters", "vec", "wheels", "loops/cmg_loss", "loops/gyro_ekf", "loops/observer_pd",
+    "loops/star_isolation", "loops/wheel_mrac",
 )  # fmt: skip
 TESTS = (
-    "test_attitude", "test_vec", "test_linear", "test_faults", "test_detection", "test_theory", "test_observer_pd", "test_singularity",
-    "test_gyro_ekf", "test_cmg_loss", "test_star_isolation", "test_wheel_mrac", "test_objectives",
+    "test_attitude", "test_vec", "test_bodies", "test_cmg", "test_controllers", "test_delays", "test_detection", "test_faults",
+    "test_filters", "test_linear", "test_observers", "test_sensors", "test_singularity", "test_star_filters", "test_wheels",
+    "test_theory", "test_observer_pd", "test_gyro_ekf", "test_cmg_loss", "test_star_isolation", "test_wheel_mrac",
+    "test_soft_scores",
 )  # fmt: skip
 FRESH = multiprocessing.get_context("forkserver")  # processes that need not import JAX again
 LIMIT = 600  # [s] wall time of one mutant
@@ -238,7 +240,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.mutants", description=__doc__)
     parser.add_argument("--count", type=int, default=60)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--module", nargs="*", help="draw from these alone, for instance systems/gyro_ekf")
+    parser.add_argument("--module", nargs="*", help="draw from these alone, for instance loops/gyro_ekf")
     parser.add_argument("--jobs", type=int, default=2, help="mutants at a time")
     parser.add_argument("--out", type=Path, default=Path("results/mutants.jsonl"), help="where results are kept")
     args = parser.parse_args()

@@ -1,4 +1,4 @@
-/* The closed loop of jaxatt.systems.observer_pd in C: one SIMD lane per scenario, as the limit of what a CPU can do.
+/* The closed loop of jaxatt.loops.observer_pd in C: one SIMD lane per scenario, as the limit of what a CPU can do.
 
    Same equations, faults, tallies and order of events as the JAX system; a noise generator of its own. REAL is float
    or double. A vector holds the lanes of one 512-bit register; gcc splits it where the machine has shorter ones.
@@ -146,13 +146,13 @@ INLINE Vec twice(Vec a) { return plus(a, a); }
 /* the loop */
 
 typedef struct { /* params, in the order of the leaves of observer_pd.Params, then the largest moment */
-    REAL alpha, beta, sigma, k_q, k_w0, eps, J[9], q_d[3], w_d[3], u_max, sign, lambda_max;
+    REAL alpha, beta, sigma, k_q, k_w0, eps, J[9], q_d[3], w_d[3], u_max, lambda_max;
 } Params;
 
 typedef struct { V onset, end, bias, drift, settled, rate, spread, std, scale; M stuck; } Fault; /* one channel */
 
 typedef struct { /* what stays during a run of one vector of lanes */
-    Sym J4, J_inv4, Jh4, Jh_inv4; /* 4 J with the sign of w x J w, its inverse without; of the observer */
+    Sym J4, J_inv4, Jh4, Jh_inv4; /* 4 J and its inverse; those of the observer */
     V alpha4, beta4, k4_q, u4_max, pp;
     Vec p, w_d; /* p = -q_d */
     REAL h;
@@ -161,8 +161,8 @@ typedef struct { /* what stays during a run of one vector of lanes */
 typedef struct { V gain[CHANNELS], offset[CHANNELS], k_w, k4_w; Vec wanted; } Hold; /* what stays during a tick */
 
 typedef struct { /* what a sweep keeps: sums, counts, extremes */
-    V delay, start_alarms, start_ticks, false_alarms, false_ticks, missed, ill_ticks, sum_q, sum_w, sum_u, ill_q, ill_w,
-        ill_u, peak_q, peak_w, peak_u, outside, end;
+    V delay, start_alarms, start_ticks, false_alarms, false_ticks, missed, faulty_ticks, sum_q, sum_w, sum_u, faulty_q,
+        faulty_w, faulty_u, peak_q, peak_w, peak_u, outside, end;
     M ok;
 } Tally;
 
@@ -204,12 +204,12 @@ INLINE X flow(const Plant *c, X x, Seen y) {
     Vec xi_q = minus(yq, x.qh), xi_w = minus(yw, x.wh), y2 = twice(yq), q2 = twice(x.q);
     V a = 1 - dot(yq, yq);
     Vec m = {c->beta4 * xi_w.x + u4.x, c->beta4 * xi_w.y + u4.y, c->beta4 * xi_w.z + u4.z};
-    m = cross_plus(x.wh, apply(&c->Jh4, yw), m);
+    m = cross_plus(apply(&c->Jh4, yw), x.wh, m);
     m = cross_plus(xi_q, y2, sum_plus(a, xi_q, dot(y2, xi_q), yq, m));
     Vec dqh = cross_plus(y2, x.wh, sum_plus(a, x.wh, dot(y2, x.wh), yq, times(c->alpha4, xi_q)));
     V a_q = 1 - dot(x.q, x.q), b_q = dot(x.q, x.w);
     Vec dq = cross_plus(q2, x.w, (Vec){a_q * x.w.x + b_q * q2.x, a_q * x.w.y + b_q * q2.y, a_q * x.w.z + b_q * q2.z});
-    return (X){dq, apply(&c->J_inv4, cross_plus(x.w, apply(&c->J4, x.w), u4)), dqh, apply(&c->Jh_inv4, m)};
+    return (X){dq, apply(&c->J_inv4, cross_plus(apply(&c->J4, x.w), x.w, u4)), dqh, apply(&c->Jh_inv4, m)};
 }
 
 INLINE X flow_at(const Plant *c, const Hold *z, X x) { return flow(c, x, see(c, z, x)); }
@@ -255,8 +255,6 @@ INLINE void begin(Loop *l, const Params *params, const REAL *scenario, uint64_t 
     c->Jh4 = scaled(all(4), (Sym){m[0], m[1], m[2], m[4], m[5], m[8]});
     c->J_inv4 = inverse(&c->J4);
     c->Jh_inv4 = inverse(&c->Jh4);
-    c->J4 = scaled(NEXT, c->J4);
-    c->Jh4 = scaled(all(params->sign), c->Jh4);
     c->alpha4 = all(4 * params->alpha);
     c->beta4 = all(4 * params->beta);
     c->k4_q = all(4 * params->k_q);
@@ -306,15 +304,15 @@ INLINE void tick(Loop *l, const Params *params, const REAL *normals, int drawn, 
             noise[i + 1] = __builtin_convertvector(b, V);
         }
     V truth[CHANNELS] = {x.q.x, x.q.y, x.q.z, x.w.x, x.w.y, x.w.z}, *y = l->y;
-    M ill = {0};
+    M faulty = {0};
     for (int i = 0; i < CHANNELS; i++) {
         const Fault *f = &l->fault[i];
         M on = (t >= f->onset) & (t < f->end);
-        V faulty = f->settled - f->drift * exp2_of(largest(t - f->onset, all(0)) * f->rate) + f->spread * noise[i];
+        V errs = f->settled - f->drift * exp2_of(largest(t - f->onset, all(0)) * f->rate) + f->spread * noise[i];
         z->gain[i] = pick(on, f->scale, all(1));
-        z->offset[i] = pick(on, pick(f->stuck, y[i], faulty), f->std * noise[i]);
+        z->offset[i] = pick(on, pick(f->stuck, y[i], errs), f->std * noise[i]);
         y[i] = z->gain[i] * truth[i] + z->offset[i];
-        ill |= on;
+        faulty |= on;
     }
     Vec yq = {y[0], y[1], y[2]}, yw = {y[3], y[4], y[5]};
 
@@ -346,9 +344,9 @@ INLINE void tick(Loop *l, const Params *params, const REAL *normals, int drawn, 
     s->delay = smallest(s->delay, pick(alarm & ~before, t - l->onset, all(INFINITY)));
     s->start_ticks += count(early), s->start_alarms += count(early & alarm);
     s->false_ticks += count(later), s->false_alarms += count(later & alarm);
-    s->ill_ticks += count(ill), s->missed += count(ill & ~alarm);
+    s->faulty_ticks += count(faulty), s->missed += count(faulty & ~alarm);
     s->sum_q += qq, s->sum_w += ww, s->sum_u += uu;
-    s->ill_q += kept(ill, qq), s->ill_w += kept(ill, ww), s->ill_u += kept(ill, uu);
+    s->faulty_q += kept(faulty, qq), s->faulty_w += kept(faulty, ww), s->faulty_u += kept(faulty, uu);
     s->peak_q = pick(start, s->peak_q, largest(s->peak_q, qq)); /* squares; the root is taken at the end */
     s->peak_w = pick(start, s->peak_w, largest(s->peak_w, ww));
     s->peak_u = largest(s->peak_u, uu);
@@ -365,16 +363,16 @@ INLINE void values(const Tally *s, long ticks, long n, REAL *out) {
         s->delay,
         mean(s->start_alarms, s->start_ticks),
         mean(s->false_alarms, s->false_ticks),
-        mean(s->missed, s->ill_ticks),
+        mean(s->missed, s->faulty_ticks),
         root(mean(s->sum_q, all_ticks)),
         root(mean(s->sum_w, all_ticks)),
-        root(mean(s->ill_q, s->ill_ticks)),
-        root(mean(s->ill_w, s->ill_ticks)),
+        root(mean(s->faulty_q, s->faulty_ticks)),
+        root(mean(s->faulty_w, s->faulty_ticks)),
         pick(s->peak_q < 0, all(NAN), root(s->peak_q)),
         pick(s->peak_w < 0, all(NAN), root(s->peak_w)),
         pick(s->end < 0, all(NAN), settled),
         root(mean(s->sum_u, all_ticks)),
-        root(mean(s->ill_u, s->ill_ticks)),
+        root(mean(s->faulty_u, s->faulty_ticks)),
         pick(s->peak_u < 0, all(NAN), root(s->peak_u)),
         count(s->ok),
     };
@@ -399,7 +397,7 @@ INLINE void run(int side, const Params *params, const REAL *scenario, const REAL
 #define RUN(side, normals, drawn) \
     run(side, params, scenario + i, normals, drawn, seed * 0x2545f4914f6cdd1du + i, n, ticks, substeps, dt, out + i)
 
-/* n scenarios, a multiple of lanes(); params (24), scenario (78, n): leaves of the system's trees in their order;
+/* n scenarios, a multiple of lanes(); params (23), scenario (77, n): leaves of the system's trees in their order;
    noise: 0 none, 1 drawn here, 2 given in normals (ticks, 6, n); out (15, n): Scores */
 void observer_pd(const REAL *numbers, const REAL *scenario, const REAL *normals, int noise, uint64_t seed, long n,
                  long ticks, int substeps, double dt, REAL *out) {

@@ -1,4 +1,4 @@
-"""Speed of `jaxatt.systems.observer_pd` as ratios in one run: against C, naive vmapped JAX and batched NumPy.
+"""Speed of `jaxatt.loops.observer_pd` as ratios in one run: against C, naive vmapped JAX and batched NumPy.
 
 A scenario-step is one RK4 step of one scenario. Every loop computes the scores of a sweep, with every fault kind
 live; ``shipped`` is four steps per tick, ``one-step`` one.
@@ -21,8 +21,8 @@ import numpy as np
 import jaxatt
 from benchmarks.measure import c_library, cpu_ns, seconds
 from jaxatt import Fault, Vec3, sweep
-from jaxatt.engine import compiled
-from jaxatt.systems.observer_pd import START_UP, Params, Scenario, Scores, params, scenario, score, system
+from jaxatt.compiling import compiled
+from jaxatt.loops.observer_pd import START_UP, Params, Scenario, Scores, params, scenario, score, system
 from jaxatt.tuning import value_and_gradient
 
 TICKS = 1000
@@ -30,7 +30,7 @@ FORMS = {"shipped": system, "one-step": system._replace(substeps=1, dt=system.dt
 
 
 def _quiet_tick(p, s, now, x, z, none):
-    return system.tick(p, s, now, x, z, jnp.zeros((system.normals, *z.board.k_w.shape), z.board.k_w.dtype))
+    return system.tick(p, s, now, x, z, jnp.zeros(system.normals, z.k_w.dtype))
 
 
 def quiet(loop):
@@ -64,7 +64,9 @@ def scenarios(n: int, dtype, seed: int = 0) -> Scenario:
 # C
 
 
-def c_scores(library, p: Params, s: Scenario, *, ticks: int, dt: float, substeps: int, noise="none", seed=1) -> Scores:
+def c_scores(
+    library, p: Params, s: Scenario, *, ticks: int, dt: float, substeps: int, noise: Any = "none", seed=1
+) -> Scores:
     """Scores of n scenarios by the C program; noise: "none", "drawn", or normals of shape (ticks, 6, n)."""
     run, out, n = _c_call(library, p, s, ticks, dt, substeps, noise, seed)
     run()
@@ -105,18 +107,17 @@ class Plain(NamedTuple):
     w_hat: Any  # (3,)
     J: Any  # (3, 3)
     J_inv: Any  # (3, 3)
-    sign: Any  # ()
     std: Any  # (6,)
     fault: Any  # Fault of (6,)
 
 
 def plain_of(s: Scenario) -> Plain:
-    """The scenarios, shape (n,), as plain arrays with n last."""
+    """The scenarios, leaves of shape (n,), as plain arrays with n last."""
     J = np.array(s.J)
     inv = np.moveaxis(np.linalg.inv(np.moveaxis(J, -1, 0)), 0, -1)
     std = np.stack([s.std_q] * 3 + [s.std_w] * 3)
     fault = Fault(*(np.stack(f) for f in zip(*s.star, *s.gyro)))
-    return Plain(np.stack(s.q), np.stack(s.w), np.stack(s.q_hat), np.stack(s.w_hat), J, inv, s.sign, std, fault)
+    return Plain(np.stack(s.q), np.stack(s.w), np.stack(s.q_hat), np.stack(s.w_hat), J, inv, std, fault)
 
 
 def plain_loop(xp, mul, p: Params, s: Plain, dt, substeps):
@@ -149,8 +150,8 @@ def plain_loop(xp, mul, p: Params, s: Plain, dt, substeps):
         y_q, y_w = gain[:3] * q + offset[:3], gain[3:] * w + offset[3:]
         u = torque(y_q, y_w, k_w)
         xi_q, xi_w = y_q - qh, y_w - wh
-        dw = mul(s.J_inv, s.sign * cross(w, mul(s.J, w)) + u)
-        dwh = mul(Jh_inv, p.sign * cross(wh, mul(Jh, y_w)) + p.beta * xi_w + rate(y_q, xi_q, -1) + u)
+        dw = mul(s.J_inv, u - cross(w, mul(s.J, w)))
+        dwh = mul(Jh_inv, u - cross(wh, mul(Jh, y_w)) + p.beta * xi_w + rate(y_q, xi_q, -1))
         return rate(q, w), dw, rate(y_q, wh) + p.alpha * xi_q, dwh
 
     def rk4(x, h, *held):
@@ -187,15 +188,15 @@ def plain_loop(xp, mul, p: Params, s: Plain, dt, substeps):
         u = torque(y[:3], y[3:], k_w)
         e_q, e_w = error(q), w - w_d
         qq, ww, uu = dot(e_q, e_q), dot(e_w, e_w), dot(u, u)
-        ill, before, start = on.any(axis=0), t < onset, t < START_UP
+        faulty, before, start = on.any(axis=0), t < onset, t < START_UP
         o = tally
         tally = (
             xp.minimum(o[0], xp.where(alarm & ~before, t - onset, inf)),
             o[1] + (start & before & alarm), o[2] + (start & before),
             o[3] + (~start & before & alarm), o[4] + (~start & before),
-            o[5] + (ill & ~alarm), o[6] + ill,
+            o[5] + (faulty & ~alarm), o[6] + faulty,
             o[7] + qq, o[8] + ww, o[9] + uu,
-            o[10] + xp.where(ill, qq, 0), o[11] + xp.where(ill, ww, 0), o[12] + xp.where(ill, uu, 0),
+            o[10] + xp.where(faulty, qq, 0), o[11] + xp.where(faulty, ww, 0), o[12] + xp.where(faulty, uu, 0),
             xp.maximum(o[13], xp.where(start, -inf, xp.sqrt(qq))),
             xp.maximum(o[14], xp.where(start, -inf, xp.sqrt(ww))),
             xp.maximum(o[15], xp.sqrt(uu)),
@@ -363,5 +364,5 @@ def _wall() -> float:
 
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)
-    jaxatt.fast_cpu()
+    jaxatt.configure()
     print(_wall())

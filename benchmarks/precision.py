@@ -19,7 +19,7 @@ import numpy as np
 
 import jaxatt
 from jaxatt import simulate
-from jaxatt.systems import cmg_loss, gyro_ekf, observer_pd, star_isolation, wheel_mrac
+from jaxatt.loops import cmg_loss, gyro_ekf, observer_pd, star_isolation, wheel_mrac
 
 NAMES = (
     "observer_pd",
@@ -60,7 +60,7 @@ def deviations(name: str, share: float = 1.0):
     for real in (np.float32, np.float64):
         p, s = jax.tree.map(lambda a, real=real: np.asarray(a, real), (params, scenario))
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # what the door says of float32 is what is measured here
+            warnings.simplefilter("ignore")  # what the warnings say of float32 is measured here
             logs.append(simulate(system, p, s, jax.random.key(3), ticks=ticks, every=every))
     single, double = (jax.tree_util.tree_leaves_with_path(log) for log in logs)
     worst: dict[str, list[float]] = {}
@@ -85,7 +85,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("results/precision.json"), help="table as JSON")
     args = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    jaxatt.fast_cpu()
+    jaxatt.configure()
     rows = []
     for name in args.names or NAMES:
         print(f"\n{name}\n  {'number of the log':28}{'deviation':>12}{'largest value':>16}{'share':>10}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,27 +13,28 @@ import numpy as np
 
 from jaxatt import System, check, scores
 from jaxatt.campaign import Campaign, run
+from jaxatt.check import positive
 
 
 class Params(NamedTuple):
-    gain: Any = 2.0  # () [1/s^2]
-    table: Any = np.linspace(0, 1, 3)  # (3,) [1]
+    gain: Annotated[Any, "1/s^2", positive] = 2.0
+    table: Annotated[Any, "1", (3,)] = np.linspace(0, 1, 3)
 
 
 class Scenario(NamedTuple):
-    start: Any = 1.0  # () [m]
-    push: Any = 0.0  # () [m/s^2]
+    start: Annotated[Any, "m"] = 1.0
+    push: Annotated[Any, "m/s^2"] = 0.0
 
 
 class State(NamedTuple):
-    x: Any
-    v: Any
+    x: Annotated[Any, "m"]
+    v: Annotated[Any, "m/s"]
 
 
 class Scores(NamedTuple):
-    rms: Any  # [m]
-    far: Any  # [s] first time outside 1 m; inf if never
-    last: Any  # (2,) [m, m/s]
+    rms: Annotated[Any, "m"]
+    far: Annotated[Any, "s"]  # first time outside 1 m; inf if never
+    last: Annotated[Any, "m, m/s", (2,)]
     ok: Any
 
 
@@ -51,7 +52,6 @@ def flow(params, scenario, t, x, z):
 
 
 def refuse_bad(params, scenario):
-    check.positive("params.gain", params.gain)
     check.between("scenario.start", scenario.start, -1e3, 1e300, "the arena")
 
 
@@ -72,7 +72,7 @@ def draw(key, index):
 def sample(key, index):
     drawn = draw(key, index)
     start = jnp.where(index == 5, 1e200, jnp.where(index == 300, -1e6, drawn["start"]))  # 5 diverges, 300 is refused
-    return Scenario(start, jnp.where(index == 5, 1e308, drawn["push"]))
+    return Scenario(start, jnp.where(index == 5, 1.7e308, drawn["push"]))
 
 
 def record(log):
@@ -84,7 +84,7 @@ system = System(init, tick, flow, dt=0.1, substeps=2, normals=1, check=refuse_ba
 
 def campaign(block: int = 128, **change):
     one = Campaign(system, Params(), sample, jax.random.key(3), 30, score, inputs=draw, block=block)
-    return one._replace(**{"units": {"rms": "m", "far": "s", "start": "m"}, **change})
+    return one._replace(**{"units": {"start": "m"}, **change})
 
 
 def work(path, blocks, block=128, shard=(0, 1), **change):

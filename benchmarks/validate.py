@@ -30,18 +30,18 @@ import numpy as np
 import jaxatt
 from benchmarks.measure import cpu_ns
 from benchmarks.measure import seconds as seconds_of
-from jaxatt import System, Vec3, scores, simulate, sweep
+from jaxatt import System, scores, simulate, sweep
 from jaxatt.attitude import mrp_error, mrp_inner, mrp_rate
-from jaxatt.bodies import body_acceleration, wheeled_acceleration
+from jaxatt.bodies import body_acceleration
 from jaxatt.controllers import pd
-from jaxatt.mounting import along, total
-from jaxatt.vec import Mat3, array, inverse, mat3, vec3
+from jaxatt.vec import Mat3, Vec3, array, project, resultant, zeros
 
 DT = 0.1  # [s] control period and integration step
 SECONDS = 300
 LIMIT = 1e-11  # [1] MRP, [rad/s]
 HUB = np.array([[90.0, 2.0, -1.0], [2.0, 80.0, 3.0], [-1.0, 3.0, 60.0]])  # [kg m^2] wheels included
 AXES = np.array([[1, -1, -1, 1], [1, 1, -1, -1], [2**0.5] * 4]) / 2  # (3, 4) spin axes
+SHARES = np.linalg.pinv(AXES).T  # (3, 4) what each wheel takes of a torque
 SPIN = 0.05  # [kg m^2] Js, of a wheel about its spin axis
 K, P = 3.5, 30.0  # [N m], [N m s] gains
 TARGET = np.array([0.2, -0.1, 0.3])  # [1] MRP
@@ -57,9 +57,9 @@ OMEGA0 = np.array([100.0, -50.0, 80.0, 20.0])  # [rad/s] wheel speeds
 class Params(NamedTuple):
     """What drives the body; the defaults do nothing."""
 
-    k: Any = 0.0  # () [N m] gain on the MRP error
-    p: Any = 0.0  # () [N m s] gain on the rate
-    q_d: Vec3 = Vec3(0.0, 0.0, 0.0)  # [1] target MRP
+    k: Any = 0.0  # [N m] gain on the MRP error
+    p: Any = 0.0  # [N m s] gain on the rate
+    q_d: Vec3 = zeros()  # [1] target MRP
     amplitude: Any = np.zeros(4)  # (4,) [N m] of sinusoidal motor torques
     frequency: Any = np.zeros(4)  # (4,) [rad/s]
 
@@ -86,7 +86,6 @@ class Z(NamedTuple):
 
     u: Vec3  # [N m] torque on the body
     motor: Any  # (4,) [N m] torque on the wheels
-    J_inv: Mat3
 
 
 class Log(NamedTuple):
@@ -97,33 +96,29 @@ class Log(NamedTuple):
     h: Any
 
 
-WHEELS = tuple(vec3(a) for a in AXES.T)
-
-
 def init(params: Params, s: Scenario):
     """x, z at the start."""
-    return X(s.q, s.w, s.h), Z(Vec3(0.0, 0.0, 0.0), jnp.zeros(4), inverse(s.J))
+    return X(s.q, s.w, s.h), Z(zeros(), jnp.zeros(4))
 
 
 def tick(params: Params, s: Scenario, now, x: X, z: Z, noise, *, wheels: bool):
     """The torque of the next period, by an ideal actuator or through the wheels."""
     x = x._replace(q=mrp_inner(x.q))
     u = pd(mrp_error(x.q, params.q_d), x.w, params.k, params.p)
-    motor = jnp.zeros_like(x.h)
     if wheels:
-        each_wheel = lambda a: a.reshape(4, *(1,) * (x.h.ndim - 1))
-        given = each_wheel(params.amplitude) * jnp.sin(each_wheel(params.frequency) * now.t)
-        motor = given - along(tuple(vec3(a) for a in np.linalg.pinv(AXES)), u)
-        u = 0 * u
-    return x, Z(u, motor, z.J_inv), Log(x.q, x.w, x.h)
+        motor = params.amplitude * jnp.sin(params.frequency * now.t) - project(SHARES, u)
+        z = Z(zeros(), motor)
+    else:
+        z = Z(u, jnp.zeros(4))
+    return x, z, Log(x.q, x.w, x.h)
 
 
 def flow(params: Params, s: Scenario, t, x: X, z: Z, *, wheels: bool) -> X:
     """dx/dt."""
     if wheels:
-        w = wheeled_acceleration(x.w, total(WHEELS, x.h), total(WHEELS, z.motor), s.J, z.J_inv)
+        w = body_acceleration(x.w, -resultant(AXES, z.motor), s.J, resultant(AXES, x.h))
     else:
-        w = body_acceleration(x.w, z.u, s.J, z.J_inv)
+        w = body_acceleration(x.w, z.u, s.J)
     return X(mrp_rate(x.q, x.w), w, z.motor)
 
 
@@ -135,21 +130,18 @@ def score(params: Params, s: Scenario, now, log: Log):
 BODY = System(init, partial(tick, wheels=False), partial(flow, wheels=False), dt=DT)
 WHEELED = System(init, partial(tick, wheels=True), partial(flow, wheels=True), dt=DT)
 IDLE, OPEN = Params(), Params(amplitude=AMPLITUDE, frequency=FREQUENCY)
-FEEDBACK = Params(k=K, p=P, q_d=vec3(TARGET))
+FEEDBACK = Params(k=K, p=P, q_d=Vec3.of(TARGET))
 
 
-def scenario_of(q, w, omega, wheels: bool) -> Scenario:
-    """The scenario of MRP, rates and wheel speeds of shape (3 or 4, *lanes)."""
+def scenario_of(q, w, h, wheels: bool = True) -> Scenario:
+    """The scenario of an MRP (3,), a rate (3,) and wheel momenta (4,)."""
     spin = SPIN if wheels else 0.0
-    J = HUB - spin * AXES @ AXES.T
-    lanes = np.shape(q)[1:]
-    h = spin * (omega + np.einsum("ij,i...->j...", AXES, w))
-    return Scenario(vec3(q), vec3(w), h, jax.tree.map(lambda a: np.broadcast_to(a, lanes), mat3(J)))
+    return Scenario(Vec3.of(q), Vec3.of(w), h, Mat3.of(HUB - spin * AXES @ AXES.T))
 
 
 def ours(loop: System, params: Params, seconds: float) -> dict[str, np.ndarray]:
     """Attitude (T, 3), rate (T, 3) and wheel speed (T, 4) by jaxatt."""
-    s = scenario_of(Q0, W0, OMEGA0, loop is WHEELED)
+    s = scenario_of(Q0, W0, SPIN * (OMEGA0 + W0 @ AXES), loop is WHEELED)
     log = simulate(loop, params, s, jax.random.key(0), ticks=round(seconds / DT) + 1)
     q, w, h = (np.asarray(a) for a in (array(log.q).T, array(log.w).T, log.h))
     return {"attitude": q, "rate": w, **({"wheel speed": h / SPIN - w @ AXES} if loop is WHEELED else {})}
@@ -274,12 +266,12 @@ def basilisk(loop: str, seconds: float, record: bool = True, start=(Q0, W0, OMEG
     return run
 
 
-# the same loop on plain arrays: state (10, *lanes) of q, w, h
+# the same loop on plain arrays: state (10,) or (10, n) of q, w, h
 
 
 def plain(xp, h, J):
     """tick(state) -> state, motor torque and flow(state, motor) of the closed loop with wheels, components first."""
-    J_inv, axes, share = np.linalg.inv(J), AXES, np.linalg.pinv(AXES)
+    J_inv, axes, share = np.linalg.inv(J), AXES, SHARES.T
     dot = lambda a, b: (a * b).sum(0)
     cross = partial(xp.cross, axis=0)
     mul = lambda m, v: xp.einsum("ij,j...->i...", m, v)
@@ -359,31 +351,25 @@ def by_diffrax(start, ticks: int):
         return tick(jax.lax.scan(step, x, jnp.arange(ticks))[0])[0]
 
     run = jax.jit(jax.vmap(one))
-    lanes = jnp.asarray(start.T)
-    return lambda: run(lanes).T
+    each = jnp.asarray(start.T)
+    return lambda: run(each).T
 
 
 def by_jaxatt(start, ticks: int):
     """() -> state (10, n) at the end by jaxatt: a sweep, or one run where there is one scenario."""
-    q, w, h = start[:3], start[3:6], start[6:]
-    J = HUB - SPIN * AXES @ AXES.T
     key = jax.random.key(0)
-    n = start.shape[1]
-    if n == 1:
-        s = Scenario(vec3(q[:, 0]), vec3(w[:, 0]), h[:, 0], mat3(J))
+    scenarios = jax.vmap(lambda x: scenario_of(x[:3], x[3:6], x[6:]))(start.T)
 
-        def one():
-            log = simulate(WHEELED, FEEDBACK, s, key, ticks=ticks + 1)  # with its log, as one runs a single scenario
-            return np.concatenate([np.stack(log.q)[:, -1:], np.stack(log.w)[:, -1:], log.h[-1:].T])
+    def one():
+        s = jax.tree.map(lambda a: a[0], scenarios)
+        log = simulate(WHEELED, FEEDBACK, s, key, ticks=ticks + 1)  # with its log, as one runs a single scenario
+        return np.concatenate([np.stack(log.q)[:, -1:], np.stack(log.w)[:, -1:], log.h[-1:].T])
 
-        return one
-    s = Scenario(vec3(q), vec3(w), h, jax.tree.map(lambda a: np.broadcast_to(a, (n,)), mat3(J)))
+    def many():
+        end = sweep(WHEELED, FEEDBACK, scenarios, key, ticks=ticks + 1, score=score, progress=False)
+        return np.concatenate([np.stack(end.q), np.stack(end.w), end.h.T])
 
-    def run():
-        end = sweep(WHEELED, FEEDBACK, s, key, ticks=ticks + 1, score=score, progress=False)
-        return np.concatenate([np.stack(end.q), np.stack(end.w), end.h])
-
-    return run
+    return one if start.shape[1] == 1 else many
 
 
 def starts(n: int, seed: int = 0):
@@ -470,7 +456,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("results/validate.json"), help="tables as JSON")
     args = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    jaxatt.fast_cpu()
+    jaxatt.configure()
     print(f"Python {platform.python_version()}, JAX {jax.__version__}; RK4, step {DT} s, {SECONDS} s")
     print(f"\n  {'largest difference to Basilisk':38}{'difference':>12}{'largest value':>16}")
     table = []

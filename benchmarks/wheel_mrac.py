@@ -10,10 +10,14 @@ import jaxatt
 from benchmarks.measure import cpu_ns, seconds
 from jaxatt import scores
 from jaxatt.controllers import Adaptation
-from jaxatt.study import batch
-from jaxatt.systems import wheel_mrac as wm
+from jaxatt.loops import wheel_mrac as wm
 
 SUBSTEPS = 8
+
+
+def equal(n: int):
+    """n times the paper's scenario."""
+    return jax.tree.map(lambda a: np.full(n, a), wm.scenario)
 
 
 def rows(quick: bool):
@@ -21,10 +25,10 @@ def rows(quick: bool):
     n, ticks = 1024, 500 if quick else 4501
     steps, key = n * ticks, jax.random.key(0)
     for real in (np.float32, np.float64):
-        params, scenarios = jax.tree.map(lambda a, real=real: np.asarray(a, real), (wm.params, batch(wm.scenario, n)))
+        params, scenarios = jax.tree.map(lambda a, real=real: np.asarray(a, real), (wm.params, equal(n)))
         for name, system in (
-            ("continuous", wm.loop(substeps=SUBSTEPS)),
-            ("sampled", wm.loop(sampled=True, substeps=SUBSTEPS)),
+            ("continuous", wm.system_of(substeps=SUBSTEPS)),
+            ("sampled", wm.system_of(sampled=True, substeps=SUBSTEPS)),
         ):
             shipped = params._replace(law=params.law._replace(gamma=real(1e-8))) if name == "sampled" else params
 
@@ -36,8 +40,8 @@ def rows(quick: bool):
             yield {"name": f"{label}: tick of {SUBSTEPS} RK4 steps", "value": ns, "unit": "CPU ns"}
             yield {"name": f"{label}: RK4 step", "value": ns / SUBSTEPS, "unit": "CPU ns"}
             yield {"name": f"{label}: 90 s slews", "value": n * ticks / 4501 / seconds(run), "unit": "scenarios/s wall"}
-    lanes, ticks = 128, 500
-    worlds, system = batch(wm.scenario, lanes), wm.loop(substeps=SUBSTEPS)
+    n, ticks = 128, 500
+    worlds, system = equal(n), wm.system_of(substeps=SUBSTEPS)
 
     @jax.jit
     def gradient(theta):
@@ -51,5 +55,5 @@ def rows(quick: bool):
         return jax.value_and_grad(cost)(theta)
 
     theta = jnp.log(jnp.array([1.0, 1e-6, 1e-6]))
-    ns = cpu_ns(lambda: gradient(theta), lanes * ticks, repeats=3)
-    yield {"name": f"gradient in K, gamma, P0, float64, N = {lanes}: tick", "value": ns, "unit": "CPU ns"}
+    ns = cpu_ns(lambda: gradient(theta), n * ticks, repeats=3)
+    yield {"name": f"gradient in K, gamma, P0, float64, N = {n}: tick", "value": ns, "unit": "CPU ns"}

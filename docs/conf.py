@@ -11,12 +11,12 @@ from latex2mathml.converter import convert
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
-os.environ["JAXATT_QUICK"] = "1"  # smaller sweeps in the notebooks
 os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))  # for their kernels
 import jaxatt  # noqa: E402
+import jaxatt.fields  # noqa: E402
 
 project, author, release = "jaxatt", "the jaxatt authors", jaxatt.__version__
-extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.viewcode"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
 exclude_patterns = ["_build", "**/.ipynb_checkpoints"]
 default_role = "py:obj"
 suppress_warnings = ["mystnb.unknown_mime_type"]
@@ -68,14 +68,17 @@ def plain(text: str) -> str:
 
 
 def fields(cls) -> list[str]:
-    """The fields of a NamedTuple with the comments that say their shape, unit and meaning."""
-    found = []
+    """The fields of a NamedTuple: unit and shape by their annotation, meaning by their comment."""
+    known, found = jaxatt.fields.of(cls), []
     for line in inspect.getsource(cls).splitlines():
-        match = re.match(r"    (\w+): ([^=#]+?)(?: = (.*?))?\s*(?:# (.*))?$", line)
+        match = re.match(r"    (\w+): (.+?)(?: = (.*?))?\s*(?:  # (.*))?$", line)
         if match and match[1] in cls._fields:
-            name, kind, default, comment = match.groups()
-            said = plain(comment or ("" if kind == "Any" else f"`{kind.strip()}`"))
-            found.append(f"* **{name}**: {said}" + (f" (default ``{default}``)" if default else ""))
+            name, _, default, comment = match.groups()
+            unit, kind_of, shapes = known[name].unit, known[name].kind, known[name].shapes
+            words = [f"[{unit}]"] if unit else []
+            words += ["or".join(f" ({', '.join(map(str, shape))}) " for shape in shapes).strip()] if shapes else []
+            words += [plain(comment)] if comment else [f"`{kind_of.__name__}`"] if kind_of else []
+            found.append(f"* **{name}**: {' '.join(words)}" + (f" (default ``{default}``)" if default else ""))
     return found
 
 

@@ -15,8 +15,8 @@ import numpy as np
 from PIL import Image
 
 import jaxatt
-from jaxatt import study
-from jaxatt.systems import observer_pd as loop
+from jaxatt.loops import observer_pd as loop
+from jaxatt.plot import COLOURS
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -34,23 +34,25 @@ def overview():
 
     sizes, sigmas = np.geomspace(0.002, 0.3, CELLS), np.geomspace(0.001, 0.1, CELLS)
     size, sigma, _ = (a.ravel() for a in np.meshgrid(sizes, sigmas, np.arange(SEEDS)))
-    params, many = study.batch((loop.params, scenario), size.size)
-    many = many._replace(gyro=many.gyro._replace(x=many.gyro.x._replace(bias=size)))
-    pairs = jax.tree.map(np.float32, (params._replace(sigma=sigma), many))
 
-    def score(_, pair, now, log):
-        return loop.score(*pair, now, log)
+    def pair(size, sigma):
+        gyro = healthy._replace(x=bias._replace(bias=size))
+        return loop.params._replace(sigma=sigma), scenario._replace(gyro=gyro)
+
+    pairs = jax.vmap(pair)(np.float32(size), np.float32(sigma))
 
     started = time.perf_counter()
-    scores = jaxatt.sweep(study.varied(loop.system), (), pairs, jax.random.key(1), ticks=TICKS, score=score)
+    scores = jaxatt.sweep(
+        jaxatt.varied(loop.system), (), pairs, jax.random.key(1), ticks=TICKS, score=jaxatt.varied(loop.score)
+    )
     took = time.perf_counter() - started
     seen, false = ((a.reshape(CELLS, CELLS, SEEDS)).mean(-1) for a in (1 - scores.miss, scores.false_alarms))
     print(f"{size.size} runs of {TICKS * loop.DT:.0f} s took {took:.0f} s, compilation included")
 
     fig, (left, right) = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
     t = loop.DT * np.arange(TICKS)
-    left.semilogy(t, log.xi, color="#0072b2", linewidth=0.8, label="residual norm")
-    left.axhline(loop.params.sigma, color="#d55e00", linestyle="--", label="threshold")
+    left.semilogy(t, log.xi, color=COLOURS[0], linewidth=0.8, label="residual norm")
+    left.axhline(loop.params.sigma, color=COLOURS[1], linestyle="--", label="threshold")
     left.axvline(30, color="0.3", linestyle=":", label="gyro bias of 0.03 rad/s")
     left.set(xlabel="time [s]", ylabel="residual norm [MRP, rad/s]", title="One run")
     left.legend(loc="upper right", fontsize="small")
@@ -75,7 +77,7 @@ def shrunk(source: Path, target: Path) -> None:
 
 
 if __name__ == "__main__":
-    jaxatt.fast_cpu()
+    jaxatt.configure()
     overview()
     shrunk(HERE / "figures" / "overview.png", HERE / "figures" / "overview.png")
     named = {name for page in HERE.glob("loops/*.md") for name in re.findall(r"figures/(\w+)\.png", page.read_text())}

@@ -1,53 +1,54 @@
-"""Reproduce the papers: ``python -m experiments [NAME ...] [tune] [--quick] [--out DIR]``.
+"""Reproduce the papers: ``python -m experiments [NAME ...] [tune] [--quick] [--out DIR] [--jobs N]``.
 
-With ``tune`` as the last word the named loops' gains are tuned instead, and judged against the papers'.
-``python -m experiments NAME campaign --help``: a campaign on disk of one of the loops.
+Several loops run side by side, each in a process of its own. With ``tune`` as the last word the named loops' gains are
+tuned instead, and judged against the papers'. ``python -m experiments NAME campaign --help``: a campaign on disk of one of
+the loops.
 """
 
 from __future__ import annotations
 
 import argparse
 import importlib
+import os
 import sys
-import time
 from pathlib import Path
 
-import jax
-
-import jaxatt
-
-NAMES = ("observer_pd", "gyro_ekf", "cmg_loss", "star_isolation", "wheel_mrac")
-STUDIES = {"tune": "experiments.tuning"}  # words that may follow the names, and where the studies lie
+from experiments.report import written
+from experiments.running import EXPERIMENTS, NAMES, STUDIES, prepare, run, side_by_side
 
 
 def main() -> int:
     if sys.argv[2:3] == ["campaign"]:
-        jax.config.update("jax_enable_x64", True)
-        jaxatt.fast_cpu()
+        prepare()
         return importlib.import_module("experiments.campaigns").main(sys.argv[1], sys.argv[3:])
     parser = argparse.ArgumentParser(prog="python -m experiments", description=__doc__)
     words = f"of {', '.join(NAMES)}, none for all; then perhaps {', '.join(STUDIES)}"
     parser.add_argument("names", nargs="*", metavar="NAME", help=words)
     parser.add_argument("--quick", action="store_true", help="smaller Monte Carlo runs, the same checks")
     parser.add_argument("--out", type=Path, default=Path("results"), help="folder for figures and metrics.json")
+    parser.add_argument(
+        "--jobs", type=int, default=os.cpu_count() or 1, help="processes side by side; default: all cores"
+    )
     args = parser.parse_args()
     study = args.names.pop() if args.names and args.names[-1] in STUDIES else ""
-    package = STUDIES.get(study, "experiments")
     unknown = [name for name in args.names if name not in NAMES]
     if unknown:
         parser.error(f"`NAME` must be one of {', '.join(NAMES)}, but it is {unknown[0]}.")
-    jax.config.update("jax_enable_x64", True)
-    jaxatt.fast_cpu()
-    from experiments.report import Report
-
-    report = Report(args.out, args.quick)
-    for name in args.names or NAMES:
-        started = time.perf_counter()
-        title = f"{name} {study}".strip()
-        report.start(title.replace(" ", "_"))
-        importlib.import_module(f"{package}.{name}").run(report)
-        report.note(f"{title} took {time.perf_counter() - started:.0f} s")
-    return 0 if report.write() else 1
+    if args.jobs < 1:
+        parser.error(f"`--jobs` must be at least 1, but it is {args.jobs}.")
+    names = args.names or list(NAMES)
+    jobs = min(args.jobs, len(names))
+    how = study, args.quick, args.out
+    if jobs == 1:
+        parts = [run(name, *how) for name in names]
+    else:
+        parts = side_by_side(names, jobs, *how)
+    ok = written(args.out, parts)
+    shown = [args.out / name / f"{EXPERIMENTS[name].figure}.png" for name in names]
+    figures = [str(path) for path in shown if not study and path.exists()]
+    if figures:
+        print("figures to open first: " + " ".join(figures))
+    return 0 if ok else 1
 
 
 if __name__ == "__main__":

@@ -19,16 +19,16 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import ndtri
 
-from jaxatt import Fault, Quat, Vec3, designs, on_axes
-from jaxatt.campaign import Campaign, extend, run
-from jaxatt.faults import dead
-from jaxatt.study import varied
-from jaxatt.summary import describe, sensitivity
-from jaxatt.systems import cmg_loss as cmg
-from jaxatt.systems import gyro_ekf as ekf
-from jaxatt.systems import observer_pd as op
-from jaxatt.systems import star_isolation as star
-from jaxatt.systems import wheel_mrac as wm
+from jaxatt import Fault, Quat, Vec3, on_axes
+from jaxatt.campaign import Campaign, designs, extend, run
+from jaxatt.campaign.summary import describe, sensitivity
+from jaxatt.faults import dead_where
+from jaxatt.loops import cmg_loss as cmg
+from jaxatt.loops import gyro_ekf as ekf
+from jaxatt.loops import observer_pd as op
+from jaxatt.loops import star_isolation as star
+from jaxatt.loops import wheel_mrac as wm
+from jaxatt.sweeping import varied
 
 DEG = np.pi / 180
 
@@ -38,12 +38,12 @@ class Plan(NamedTuple):
 
     system: Any
     params: Any
-    score: Callable
+    score: Any
     ticks: int
     dims: int  # numbers drawn
     draw: Callable  # (u (dims,) in (0, 1)) -> dict of numbers
     scenario: Callable  # (numbers) -> scenario
-    units: Mapping[str, str]
+    units: Mapping[str, str]  # of the numbers drawn
     record: Callable  # (log) -> what --every records
 
 
@@ -95,12 +95,10 @@ def draw_ekf(u):
 
 def scenario_ekf(d):
     hit = jnp.any(jnp.asarray(PAIRS)[d["pair"].astype(int)][:, None] == np.arange(4), axis=0)
-    fault = jax.tree.map(lambda a: jnp.broadcast_to(a, (4,)), dead())
-    fault = fault._replace(onset=jnp.where(hit, d["onset"], np.inf))
-    return ekf.scenario._replace(w=Vec3(*d["rate"]), bias=d["bias"], gyro=fault)
+    return ekf.scenario._replace(w=Vec3(*d["rate"]), bias=d["bias"], gyro=dead_where(hit, d["onset"]))
 
 
-# cmg_loss: any gimbal angles, any lost module, both structures
+# cmg_loss: any gimbal angles, any lost module, both mountings, which the computer knows; its params differ too
 
 
 def draw_cmg(u):
@@ -108,11 +106,10 @@ def draw_cmg(u):
 
 
 def scenario_cmg(d):
-    pyramid, box = (cmg.lost(skew, np.zeros(4)) for skew in (cmg.PYRAMID, cmg.BOX))
-    axes = jax.tree.map(lambda a, b: jnp.where(d["box"] == 1, b, a), pyramid.axes, box.axes)
-    this = np.arange(4) == d["module"]
-    failure = pyramid.failure._replace(onset=jnp.where(this, 0.0, np.inf), brake=jnp.where(this, 1e-6, 0.0))
-    return pyramid._replace(gamma=d["gamma"], axes=axes, failure=failure)
+    axes = jax.tree.map(lambda a, b: jnp.where(d["box"] == 1, b, a), cmg.PYRAMID, cmg.BOX)
+    this, lost = np.arange(4) == d["module"], cmg.lost(cmg.PYRAMID, np.zeros(4))
+    failure = lost.failure._replace(onset=jnp.where(this, 0.0, np.inf), brake=jnp.where(this, 1e-6, 0.0))
+    return cmg.table5._replace(axes=axes), lost._replace(gamma=d["gamma"], axes=axes, failure=failure)
 
 
 # star_isolation: size, direction, onset and kind of a fault of either star sensor or the gyro
@@ -164,42 +161,26 @@ def scenario_wheel(d):
     return params, wm.scenario._replace(J_z=d["J_z"], noise=d["noise"], wheel=wheel, drive=drive)
 
 
-def score_wheel(_, pair, now, log):
-    params, scenario = pair
-    return wm.score(params, scenario, now, log)
-
-
-RATE, SECONDS = "rad/s", "s"
 PLANS = {
     "observer_pd": Plan(
-        op.system, op.params, op.score, 700, 4, draw_observer, scenario_observer,
-        dict(size="MRP or rad/s", onset=SECONDS, delay=SECONDS, settling=SECONDS, rms_w=RATE, rms_w_ill=RATE,
-             peak_w=RATE, rms_u="N m", rms_u_ill="N m", peak_u="N m"),
-        lambda log: dict(xi=log.xi, e_q=jnp.stack(list(log.e_q))),
+        op.system, op.params, op.score, 700, 4, draw_observer, scenario_observer, dict(size="MRP or rad/s", onset="s"),
+        lambda log: dict(xi=log.xi, e_q=log.e_q),
     ),
     "gyro_ekf": Plan(
         ekf.system, ekf.params, ekf.score, 4800, 9, draw_ekf, scenario_ekf,
-        dict(onset=SECONDS, rate=RATE, bias=RATE, settling=SECONDS, peak_error="rad", final_error="rad",
-             rms_error="rad", peak_h="in-lbf-s", rms_angle="rad", rms_w=RATE, final_bias=RATE, caught=SECONDS,
-             parity=SECONDS),
-        lambda log: dict(angle=jnp.stack(list(log.angle)), w=jnp.stack(list(log.w))),
+        dict(onset="s", rate="rad/s", bias="rad/s"), lambda log: dict(angle=log.angle, w=log.w),
     ),
     "cmg_loss": Plan(
-        cmg.system._replace(substeps=1), cmg.table5, cmg.score, 6001, 6, draw_cmg, scenario_cmg,
-        dict(gamma="rad", variation=RATE, acceleration="rad/s^2", condition_at=SECONDS, settling=SECONDS, final=RATE,
-             start=RATE, momentum="N m s"),
-        lambda log: dict(w=jnp.stack(list(log.w)), gamma=log.gamma),
+        varied(cmg.system._replace(substeps=1)), (), varied(cmg.score), 6001, 6, draw_cmg, scenario_cmg,
+        dict(gamma="rad"), lambda log: dict(w=log.w, gamma=log.gamma),
     ),
     "star_isolation": Plan(
         star.system, star.params, star.score, 3000, 15, draw_star, scenario_star,
-        dict(size="std of the sensor", direction="rad", onset=SECONDS, tau=SECONDS, delay=SECONDS, alarm_end=SECONDS,
-             angle_delay=SECONDS, error="rad", pointing="rad", peak_u="N m"),
-        lambda log: dict(error=jnp.stack(list(log.error))),
+        dict(size="std of the sensor", direction="rad", onset="s", tau="s"), lambda log: dict(error=log.error),
     ),
     "wheel_mrac": Plan(
-        varied(wm.loop(substeps=8)), (), score_wheel, 4501, 9, draw_wheel, scenario_wheel,
-        dict(J_z="kg m^2", believed_J="kg m^2", gamma="1", noise="deg", friction="deg/s^2", onset=SECONDS, peak="deg", rms="deg",
-             peak_ill="deg", delay=SECONDS, settling_ill=SECONDS, J_settling=SECONDS, chatter="deg/s"),
+        varied(wm.system_of(substeps=8)), (), varied(wm.score), 4501, 9, draw_wheel, scenario_wheel,
+        dict(believed_J="kg m^2", K="1/s", gamma="s/deg^2", J_z="kg m^2", noise="deg", friction="deg/s^2", onset="s"),
         lambda log: dict(error=log.error),
     ),
 }  # fmt: skip

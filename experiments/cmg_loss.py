@@ -8,17 +8,16 @@ import numpy as np
 from matplotlib.patches import Circle
 
 from experiments.report import Report, interval
-from jaxatt import plot, simulate, sweep
+from jaxatt import plot, simulate, sweep, varied
 from jaxatt import singularity as sg
-from jaxatt.controllers import Steering
-from jaxatt.mounting import cmg_triads, modules
-from jaxatt.systems import cmg_loss as cmg
+from jaxatt.cmg import Steering, cmg_triads, condition, modules
+from jaxatt.loops import cmg_loss as cmg
+from jaxatt.plot import COLOURS, LINES, MARKS
 from jaxatt.vec import Vec3, array
 
 KEY = jax.random.key(0)
 PAPER, REFERENCE = "Jin & Leeghim (2021)", "reference"
-SKEW = {"pyramid": cmg.PYRAMID, "box-90": cmg.BOX}
-FOUR = {name: cmg.lost(skew, np.zeros(4)).axes for name, skew in SKEW.items()}
+FOUR = {"pyramid": cmg.PYRAMID, "box-90": cmg.BOX}
 THREE = {name: modules(axes, [0, 1, 2]) for name, axes in FOUR.items()}
 NAMES = np.array(["proper", "lock", "fluctuation"])
 CASES = [  # structure, gamma(0) [deg], class of the paper (text and Table 5), class at the printed K_I (docs/loops/cmg_loss.md)
@@ -37,7 +36,7 @@ CASES = [  # structure, gamma(0) [deg], class of the paper (text and Table 5), c
 ]
 PRESETS = {"K_I = 0.02": cmg.params, "K_I = 0": cmg.table5}
 TICKS = 6001  # 60 s
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")  # Okabe & Ito
+LOOKS = tuple(zip(NAMES, (COLOURS[2], COLOURS[3], COLOURS[1]), ("", "///", "xxx")))  # of the classes in bars
 
 
 def run(report: Report) -> None:
@@ -50,12 +49,24 @@ def run(report: Report) -> None:
     histories(report)
 
 
-def stacked(scenarios):
-    return jax.tree.map(lambda *a: np.stack(np.broadcast_arrays(*a), -1), *scenarios)
+def stacked(trees):
+    """Scenarios of one batch, every leaf (n, ...)."""
+    return jax.tree.map(lambda *a: np.stack(np.broadcast_arrays(*a)), *trees)
 
 
 def lost(case):
-    return cmg.lost(SKEW[case[0]], case[1])
+    return cmg.lost(FOUR[case[0]], case[1])
+
+
+def informed(params, scenario):
+    """Params and scenario, the computer knowing how the modules are mounted."""
+    return params._replace(axes=scenario.axes), scenario
+
+
+def swept(params, scenarios, system=cmg.system):
+    """Scores of scenarios (n, ...) of both structures over `TICKS`."""
+    pairs = jax.vmap(lambda scenario: informed(params, scenario))(scenarios)
+    return sweep(varied(system), (), pairs, KEY, ticks=TICKS, score=varied(cmg.score), progress=False)
 
 
 # sections 3.1, 3.2
@@ -80,13 +91,13 @@ def table_3(report: Report) -> None:
         name: [np.divide(*sg.ill_conditioned(axes, 719, float(k))) for k in thresholds] for name, axes in THREE.items()
     }
     fig, ax = plt.subplots(figsize=(6, 4))
-    for (name, share), colour, mark in zip(shares.items(), COLOURS, "os"):
-        ax.loglog(thresholds, share, mark + "-", color=colour, label=name)
+    for (name, share), colour, mark, line in zip(shares.items(), COLOURS, MARKS, LINES):
+        ax.loglog(thresholds, share, mark, ls=line, color=colour, label=name)
     for k, a, b in zip(thresholds, shares["pyramid"], shares["box-90"]):
         ax.annotate(f"ratio {b / a:.2f}", (k, b), textcoords="offset points", xytext=(5, 6))
     ax.set(
-        xlabel="threshold on the condition number",
-        ylabel="share of gimbal angles above it",
+        xlabel="threshold on the condition number [1]",
+        ylabel="share of gimbal angles above it [1]",
         xlim=(7, 4000),
         ylim=(1.5e-3, 0.6),
     )
@@ -126,14 +137,16 @@ def geometry(report: Report) -> None:
     turn = np.radians(np.arange(0, 361, 1.0))
     cuts = (("x", "y", lambda c, s, o: Vec3(c, s, o)), ("x", "z", lambda c, s, o: Vec3(c, o, s)))
     fig, axs = plt.subplots(2, 2, figsize=(9, 9), sharex=True, sharey=True)
-    for row, name in zip(axs, SKEW):
+    for row, name in zip(axs, FOUR):
         for ax, (a, b, plane) in zip(row, cuts):
             d = plane(np.cos(turn), np.sin(turn), 0 * turn)
             for group, n, colour, dash in ((FOUR, 4, COLOURS[0], "-"), (THREE, 3, COLOURS[1], "--")):
                 far = np.asarray(sg.reach(group[name], d))
                 ax.plot(far * np.cos(turn), far * np.sin(turn), dash, color=colour, label=f"{n} modules")
-            ax.add_patch(Circle((0, 0), free[name], color=COLOURS[2], alpha=0.4, label="singularity-free, 3"))
-            ax.set(xlabel=f"$h_{a} / h_w$", ylabel=f"$h_{b} / h_w$", aspect="equal", title=f"{name}, {a}-{b} plane")
+            ax.add_patch(
+                Circle((0, 0), free[name], color=COLOURS[2], alpha=0.4, label="ball without singularities, 3 modules")
+            )
+            ax.set(xlabel=f"$h_{a}$ [$h_w$]", ylabel=f"$h_{b}$ [$h_w$]", aspect="equal", title=f"{name}, {a}-{b} plane")
             ax.grid(alpha=0.3)
     axs[1, 0].legend(loc="lower center", fontsize=8)
     fig.tight_layout()
@@ -142,7 +155,7 @@ def geometry(report: Report) -> None:
 
 def surfaces(report: Report) -> None:
     """Figures 3, 4, 13-16: singular surfaces; figure 5: singular gimbal angles."""
-    for name in SKEW:
+    for name in FOUR:
         fig = plt.figure(figsize=(12, 9))
         panels = [(FOUR, 4, (1, 1, 1, 1)), (FOUR, 4, (1, 1, 1, -1)), (FOUR, 4, (1, 1, -1, -1))]
         panels += [(THREE, 3, (1, 1, 1)), (THREE, 3, (1, 1, -1))]
@@ -161,10 +174,10 @@ def surfaces(report: Report) -> None:
     for i, (name, axes) in enumerate(THREE.items()):
         points = np.stack(np.meshgrid(grid, grid, grid, indexing="ij")).reshape(3, -1)
         at = jax.tree.map(lambda a: a[:, None], axes)
-        kappa = np.asarray(jax.jit(lambda g, at=at: sg.condition(cmg_triads(at, g).t))(points))
+        kappa = np.asarray(jax.jit(lambda g, at=at: condition(cmg_triads(at, g).t))(points))
         shown = np.degrees(points[:, kappa >= 100])
         ax = fig.add_subplot(1, 2, i + 1, projection="3d")
-        ax.scatter(*shown, s=1, linewidths=0, c=shown[2], cmap="viridis", rasterized=True)
+        ax.scatter(*shown, s=1, linewidths=0, c=shown[2], cmap=plot.MAP, rasterized=True)
         ax.set(xlabel="$\\gamma_1$ [deg]", ylabel="$\\gamma_2$ [deg]", zlabel="$\\gamma_3$ [deg]")
         # Room for the label of the vertical axis. The stubs know whole zooms only.
         ax.set_box_aspect(None, zoom=0.88)  # pyright: ignore[reportArgumentType]
@@ -185,7 +198,7 @@ def table_5(report: Report) -> None:
         for case in CASES
     ]
     for preset, params in PRESETS.items():
-        got = sweep(cmg.system, params, stacked(moved), KEY, ticks=TICKS, score=cmg.score, progress=False)
+        got = swept(params, stacked(moved))
         classes = cmg.classify(got).reshape(10, -1)
         expected = [case[2] if params is cmg.table5 else case[3] for case in CASES]
         source = f"{PAPER}, Table 5" if params is cmg.table5 else REFERENCE
@@ -204,7 +217,7 @@ def table_5(report: Report) -> None:
     delicate = [((90, 0, -90, 0), "K_I = 0.02"), ((90, 0, -90, 0), "K_I = 0"), ((-90, 90, 90, 95), "K_I = 0")]
     for gamma, preset in delicate:
         batch = [cmg.lost(cmg.PYRAMID, np.array(gamma) + np.degrees(1e-13 * rng.normal(size=4))) for _ in range(100)]
-        got = sweep(cmg.system, PRESETS[preset], stacked(batch), KEY, ticks=TICKS, score=cmg.score, progress=False)
+        got = swept(PRESETS[preset], stacked(batch))
         shares = np.bincount(cmg.classify(got), minlength=3)
         words = ", ".join(f"{name} {share}" for name, share in zip(NAMES, shares))
         report.note(f"pyramid {list(gamma)}, {preset}, 100 starts within 1e-13 rad: {words}")
@@ -212,9 +225,8 @@ def table_5(report: Report) -> None:
 
 def by_simulation(structure: str, gamma_4: float, params, gamma):
     """Variation of the gimbal rates of a run from each of the angles gamma (k, 3) [rad]: a rank for `rearrange`."""
-    batch = [cmg.lost(SKEW[structure], [*np.degrees(g), gamma_4]) for g in gamma]
-    system = cmg.system._replace(substeps=5)
-    return sweep(system, params, stacked(batch), KEY, ticks=TICKS, score=cmg.score, progress=False).variation
+    batch = [cmg.lost(FOUR[structure], [*np.degrees(g), gamma_4]) for g in gamma]
+    return swept(params, stacked(batch), cmg.system._replace(substeps=5)).variation
 
 
 def ties(report: Report) -> None:
@@ -248,7 +260,7 @@ def rearranged(structure: str, lost_module: int, gamma):
     axes = jax.tree.map(lambda a: a[:, None, None], modules(FOUR[structure], healthy))
     steps = np.radians(5) * np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij")).reshape(3, 27, 1)
     options = gamma[healthy][:, None] + steps
-    kappa = np.asarray(sg.condition(cmg_triads(axes, options).t))
+    kappa = np.asarray(condition(cmg_triads(axes, options).t))
     best = gamma.copy()
     best[healthy] = np.take_along_axis(options, kappa.argmin(0)[None, None], axis=1)[:, 0]
     return best, kappa[13], kappa.min(0)
@@ -258,19 +270,21 @@ def monte_carlo(report: Report) -> None:
     """Shares of the classes over gimbal starts, lost module, structure and steering law; does rearranging help?"""
     n = 256 if report.quick else 2048
     rng = np.random.default_rng(1)
-    scenarios, better, ill = [], [], []
-    for name, skew in SKEW.items():
+    scenarios, better, close = [], [], []
+    for name, axes in FOUR.items():
         for module in range(4):
             gamma = rng.uniform(0, 2 * np.pi, (4, 40 * n))
             best, kappa, _ = rearranged(name, module, gamma)
             wanted = n // 16
             pick = np.concatenate([np.arange(wanted), wanted + np.flatnonzero(kappa[wanted:] >= 50)[:wanted]])
-            ill.append(np.repeat([False, True], wanted))
-            for column, list_ in ((gamma, scenarios), (best, better)):
-                list_ += [cmg.lost(skew, np.degrees(column[:, i]), module=module) for i in pick]
-    ill = np.concatenate(ill)
-    box = np.arange(len(ill)) >= len(ill) // 2
-    batches = {"as drawn": stacked(scenarios), "rearranged": stacked(better)}
+            close.append(np.repeat([False, True], wanted))
+            day = cmg.lost(axes, np.zeros(4), module=module)
+            for angles, batches in ((gamma, scenarios), (best, better)):
+                batches.append(jax.vmap(lambda g, day=day: day._replace(gamma=g))(angles[:, pick].T))
+    close = np.concatenate(close)
+    box = np.arange(len(close)) >= len(close) // 2
+    joined = lambda batches: jax.tree.map(lambda *a: np.concatenate(a), *batches)
+    batches = {"as drawn": joined(scenarios), "rearranged": joined(better)}
     laws = {
         "pseudo-inverse": Steering(),
         "robust": Steering(lam0=0.01),
@@ -281,13 +295,13 @@ def monte_carlo(report: Report) -> None:
     for law, steering in laws.items():
         params = cmg.table5._replace(steering=steering)
         for how, batch in batches.items():
-            got = sweep(system, params, batch, KEY, ticks=TICKS, score=cmg.score, progress=False)
+            got = swept(params, batch, system)
             report.within(f"Monte Carlo, {law}, {how}: finite runs", 1, 1, np.mean(got.ok), REFERENCE)
             classes[law, how] = cmg.classify(got)
-    report.note(f"{len(ill) * len(classes)} runs, K_I = 0, 10 ms plant step; 95 % intervals")
+    report.note(f"{len(close) * len(classes)} runs, K_I = 0, 10 ms plant step; 95 % intervals")
     groups = {
-        "pyramid, any start": ~box & ~ill, "box-90, any start": box & ~ill,
-        "pyramid, condition >= 50": ~box & ill, "box-90, condition >= 50": box & ill,
+        "pyramid, any start": ~box & ~close, "box-90, any start": box & ~close,
+        "pyramid, condition >= 50": ~box & close, "box-90, condition >= 50": box & close,
     }  # fmt: skip
     fig, axs = plt.subplots(2, 2, figsize=(11, 7), sharey=True)
     for ax, (group, inside) in zip(axs.flat, groups.items()):
@@ -296,24 +310,21 @@ def monte_carlo(report: Report) -> None:
             shares = [int((cls[inside] == k).sum()) for k in range(3)]
             words = []
             bottom = 0.0
-            for k in range(3):
-                low, high = interval(shares[k], total)
-                words.append(f"{NAMES[k]} {shares[k] / total:.3f} ({low:.3f} to {high:.3f})")
-                ax.bar(
-                    x, shares[k] / total, bottom=bottom, color=(COLOURS[2], "#F0E442", COLOURS[1])[k], label=NAMES[k]
-                )
-                bottom += shares[k] / total
+            for share, (name, colour, hatch) in zip(np.array(shares) / total, LOOKS):
+                low, high = interval(round(share * total), total)
+                words.append(f"{name} {share:.3f} ({low:.3f} to {high:.3f})")
+                ax.bar(x, share, bottom=bottom, color=colour, hatch=hatch, edgecolor="white", label=name)
+                bottom += share
             report.note(f"{group}, {law}, {how}: {', '.join(words)}")
             labels.append(f"{law}\n{how}")
         ax.set_xticks(range(len(labels)), labels, fontsize=7, rotation=30)
-        ax.set(title=f"{group} ({total} starts)", ylabel="share of runs")
+        ax.set(title=f"{group} ({total} starts)", ylabel="share of runs [1]")
     handles, names = axs[0, 0].get_legend_handles_labels()
     fig.legend(handles[:3], names[:3], loc="upper center", ncols=3)
     fig.tight_layout(rect=(0, 0, 1, 0.95))
     report.figure("monte_carlo", fig)
     if not report.quick:
-        few = jax.tree.map(lambda a: a[..., ::8], batches["as drawn"])
-        fine = cmg.classify(sweep(cmg.system, cmg.table5, few, KEY, ticks=TICKS, score=cmg.score, progress=False))
+        fine = cmg.classify(swept(cmg.table5, jax.tree.map(lambda a: a[::8], batches["as drawn"])))
         coarse = classes["pseudo-inverse", "as drawn"][::8]
         shares = [[np.mean(c == k) for k in range(3)] for c in (fine, coarse)]
         # two standard deviations of a share of 256 runs: 0.0625
@@ -326,34 +337,42 @@ def histories(report: Report) -> None:
     order = list(figures.values())
     batch = stacked([lost(CASES[i]) for i in order])
     keys = jax.random.split(KEY, len(order))
-    logs = {k: simulate(cmg.system, p, batch, keys, ticks=TICKS, every=5) for k, p in PRESETS.items()}
-    t = cmg.DT * np.arange(0, TICKS, 5)
+    logs = {}
+    for preset, params in PRESETS.items():
+        run = lambda s, key, params=params: simulate(cmg.system, *informed(params, s), key, ticks=TICKS, every=5)
+        logs[preset] = jax.tree.map(np.asarray, jax.vmap(run)(batch, keys))
     peaks = {"K_I = 0.02": (52.18, 4.7, 30.4), "K_I = 0": (31.56, 6.3, 14.6)}
     for preset, log in logs.items():
-        kappa, w = np.asarray(log.condition)[::2, 0], np.linalg.norm(array(log.w), axis=0)[:, 0]
+        t, kappa, w = log.t[0], log.condition[0, ::2], np.linalg.norm(array(log.w), axis=0)[0]
         height, at, settling = peaks[preset]
         report.check(f"figure 7, {preset}: peak condition", height, kappa.max(), 0.05, REFERENCE)
         report.check(f"figure 7, {preset}: its time [s]", at, 0.1 * kappa.argmax(), 0.1, REFERENCE)
         last = t[np.flatnonzero(w > 0.05 * w[0])[-1]]
         report.check(f"figure 7, {preset}: 5 % settling [s]", settling, last, 0.1, REFERENCE)
-    for lane, number in enumerate(figures):
-        name, gamma, *_ = CASES[order[lane]]
-        fig, axs = plt.subplots(4, 2, figsize=(11, 9), sharex=True, sharey="row")
-        for column, (preset, log) in zip(axs.T, logs.items()):
-            for i in range(3):
-                column[0].plot(t, np.asarray(log.w[i])[:, lane], color=COLOURS[i], label="xyz"[i])
-                column[1].plot(t, np.degrees(log.gamma[:, i, lane]), color=COLOURS[i], label=f"module {i + 1}")
-                column[2].plot(t, log.rate[:, i, lane], color=COLOURS[i], linewidth=0.7)
-            column[3].semilogy(t, np.minimum(log.condition[:, lane], 1e6), color="black", linewidth=0.8)
-            column[0].set_title(preset.replace("K_I", "$K_I$"))
-            column[3].set(xlabel="time [s]", ylim=(1, 2e6))
-        words = ("body rate [rad/s]", "gimbal angle [deg]", "gimbal rate [rad/s]", "condition (cut at 1e6)")
-        for ax, word in zip(axs[:, 0], words):
-            ax.set_ylabel(word)
-        axs[0, 1].legend(ncols=3, fontsize=8)
-        axs[1, 1].legend(ncols=3, fontsize=8)
-        for ax in axs.flat:
-            ax.grid(alpha=0.3)
-        fig.suptitle(f"Figure {number}: {name}, $\\gamma(0)$ = {list(gamma)} deg, module 4 lost")
-        fig.tight_layout()
-        report.figure(f"figure_{number}", fig)
+    for i, number in enumerate(figures):
+        name, gamma, *_ = CASES[order[i]]
+        start = f"{name}, $\\gamma(0)$ = {list(gamma)} deg"
+        history(report, number, start, {preset: jax.tree.map(lambda a, i=i: a[i], log) for preset, log in logs.items()})
+
+
+def history(report: Report, number: str, start: str, logs: dict) -> None:
+    """One figure: body rate, gimbal angles and rates, and condition over time, a column for each K_I."""
+    fig, axs = plt.subplots(4, 2, figsize=(11, 9), sharex=True, sharey="row")
+    for column, (preset, log) in zip(axs.T, logs.items()):
+        for i, look in enumerate(dict(color=c, ls=line) for c, line in zip(COLOURS[:3], LINES)):
+            column[0].plot(log.t, log.w[i], label=f"$w_{'xyz'[i]}$", **look)
+            column[1].plot(log.t, np.degrees(log.gamma[:, i]), label=f"module {i + 1}", **look)
+            column[2].plot(log.t, log.rate[:, i], linewidth=0.7, **look)
+        column[3].semilogy(log.t, np.minimum(log.condition, 1e6), color=COLOURS[3], linewidth=0.8)
+        column[0].set_title(f"${preset}$ 1/s$^2$")
+        column[3].set(xlabel="time [s]", ylim=(1, 2e6))
+    words = ("body rate [rad/s]", "gimbal angle [deg]", "gimbal rate [rad/s]", "condition, cut at $10^6$ [1]")
+    for ax, word in zip(axs[:, 0], words):
+        ax.set_ylabel(word)
+    for ax in axs[:2, 1]:  # the gimbal rates have the colours of the angles
+        ax.legend(ncols=3, fontsize=8)
+    for ax in axs.flat:
+        ax.grid(alpha=0.3)
+    fig.suptitle(f"Figure {number}: {start}, module 4 lost")
+    fig.tight_layout()
+    report.figure(f"figure_{number}", fig)

@@ -1,8 +1,7 @@
 """Yun & Kang (2020): sensor-fault detection by a nonlinear observer, tolerance by an adaptive PD law.
 
 The paper gives no fault signals, noise law or step sizes; the reference numbers are those of an independent
-implementation with the choices written down in `jaxatt.systems.observer_pd`. Figures 1-3 are compared with
-the paper's words about them.
+implementation with the choices of docs/loops/observer_pd.md. Figures 1-3 are compared with the paper's words about them.
 """
 
 from __future__ import annotations
@@ -13,22 +12,32 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from experiments.report import interval
-from jaxatt import Fault, Vec3, objectives, on_axes, rerun, scores, simulate, sweep
+from jaxatt import Fault, noise_of, on_axes, scores, simulate, soft_scores, sweep
 from jaxatt.attitude import mrp_matrix, mrp_rate, mrp_rate_transposed
 from jaxatt.bodies import body_acceleration
 from jaxatt.engine import rk4
-from jaxatt.estimators import AttitudeRate, mrp_observer
-from jaxatt.study import batch
-from jaxatt.systems import observer_pd as op
+from jaxatt.loops import observer_pd as op
+from jaxatt.observers import AttitudeRate, mrp_observer
+from jaxatt.plot import COLOURS, GREY, LINES, MARKS
 from jaxatt.tuning import value_and_gradient
-from jaxatt.vec import array, cross, inverse, norm, vec3
+from jaxatt.vec import Vec3, array, cross, inverse, norm, zeros
 
 HEALTHY = on_axes(Fault())
 QUIET = op.scenario._replace(star=HEALTHY, gyro=HEALTHY, std_q=0.0, std_w=0.0)
 FINE = op.system._replace(dt=0.01, substeps=1)  # the grid of the reference numbers
-ZERO = Vec3(0.0, 0.0, 0.0)
 KEY = jax.random.key(2020)
 REFERENCE = "independent implementation"
+
+
+def printed_flow(params: op.Params, scenario: op.Scenario, t, x: op.X, z: op.Z) -> op.X:
+    """The loop's flow with + w x J w, as printed in (4), in body and observer; Euler's equation has - (erratum 1)."""
+    y, rate, w_hat = op.readings(z.sensors.star, z.sensors.gyro, x), op.flow(params, scenario, t, x, z), x.estimate.w
+    turned = lambda w, J, momentum: 2 * (inverse(J) @ cross(w, momentum))
+    estimate = rate.estimate._replace(w=rate.estimate.w + turned(w_hat, params.J, params.J @ y.w))
+    return rate._replace(w=rate.w + turned(x.w, scenario.J, scenario.J @ x.w), estimate=estimate)
+
+
+PRINTED = FINE._replace(flow=printed_flow)
 
 
 def run(report) -> None:
@@ -43,17 +52,17 @@ def run(report) -> None:
 def mathematics(report) -> None:
     """What must hold whatever the numbers are."""
     rng = np.random.default_rng(1)
-    J, J_inv, alpha, beta = op.INERTIA, inverse(op.INERTIA), 1.1, 15.0
+    J, alpha, beta = op.INERTIA, 1.1, 15.0
 
     def draw(size=1.0):
-        return vec3(size * rng.normal(size=(3, 1000)))
+        return Vec3.of(size * rng.normal(size=(3, 1000)))
 
     for label, noise in (("clean", 0.0), ("noisy", 0.3)):
         q, w, q_hat, w_hat, u, n_q, n_w = draw(), draw(), draw(), draw(), draw(), draw(noise), draw(noise)
         y = AttitudeRate(q + n_q, w + n_w)
-        hat = mrp_observer(AttitudeRate(q_hat, w_hat), y, u, J, J_inv, alpha, beta)
+        hat = mrp_observer(AttitudeRate(q_hat, w_hat), y, u, J, alpha, beta)
         e_q, e_w = q - q_hat, w - w_hat
-        dV = e_q @ (mrp_rate(q, w) - hat.q) + e_w @ (J @ (body_acceleration(w, u, J, J_inv) - hat.w))
+        dV = e_q @ (mrp_rate(q, w) - hat.q) + e_w @ (J @ (body_acceleration(w, u, J) - hat.w))
         exact = (
             -alpha * (e_q @ e_q) - beta * (e_w @ e_w) - alpha * (e_q @ n_q) - beta * (e_w @ n_w)
             - e_q @ (mrp_rate(y.q, w) - mrp_rate(q, w)) + e_w @ cross(w_hat, J @ n_w)
@@ -64,14 +73,14 @@ def mathematics(report) -> None:
         )
 
     q = draw()
-    G = np.stack([array(mrp_rate(q, vec3([np.full(1000, a) for a in e]))) for e in np.eye(3)], axis=1)
+    G = np.stack([array(mrp_rate(q, Vec3.of([np.full(1000, a) for a in e]))) for e in np.eye(3)], axis=1)
     excess = np.linalg.norm(np.moveaxis(G, -1, 0), 2, axis=(1, 2)) - (1 + np.asarray(q @ q)) / 4
     report.check("|G(q)| - (1 + |q|^2)/4", 0, np.abs(excess).max(), 1e-12, "reference")
 
     def flow(t, x):
-        return AttitudeRate(mrp_rate(x.q, x.w), body_acceleration(x.w, ZERO, J, J_inv))
+        return AttitudeRate(mrp_rate(x.q, x.w), body_acceleration(x.w, zeros(), J))
 
-    start = jax.tree.map(jnp.asarray, AttitudeRate(ZERO, op.scenario.w))
+    start = jax.tree.map(jnp.asarray, AttitudeRate(zeros(), op.scenario.w))
     end, _ = jax.lax.scan(lambda x, _: (rk4(flow, 0.0, x, 0.001), None), start, None, 20_000)
     momentum = [mrp_matrix(x.q) @ (J @ x.w) for x in (start, end)]
     drift = norm(momentum[1] - momentum[0]) / norm(momentum[0])
@@ -95,7 +104,7 @@ def gains(theta):
 def smooth_loss(theta, scenario):
     """A smooth loss of one run of 15 s."""
     log = simulate(op.system, gains(theta), scenario, KEY, ticks=150)
-    return jnp.mean(objectives.soft_alarm(log.xi, 0.01, 0.001) + 20 * norm(log.e_q)) + 0.02 * jnp.sqrt(
+    return jnp.mean(soft_scores.soft_alarm(log.xi, 0.01, 0.001) + 20 * norm(log.e_q)) + 0.02 * jnp.sqrt(
         jnp.mean(log.u @ log.u)
     )
 
@@ -107,13 +116,13 @@ def last_outside(values, bound: float, dt: float) -> float:
 
 def nominal(report) -> None:
     """Runs without noise and faults."""
-    for sign, settling, label in ((-1.0, 5.22, "Euler"), (1.0, 5.31, "as printed")):
-        log = simulate(FINE, op.params._replace(sign=sign), QUIET._replace(sign=sign), KEY, ticks=1000)
+    for system, settling, label in ((FINE, 5.22, "Euler"), (PRINTED, 5.31, "as printed")):
+        log = simulate(system, op.params, QUIET, KEY, ticks=1000)
         name = f"|q| < 0.01 after [s], dynamics {label}"
         report.check(name, settling, last_outside(norm(log.q), 0.01, 0.01) + 0.01, 0.02, REFERENCE)
-        if sign < 0:
+        if system is FINE:
             report.check("peak |u| [N m]", 147.52, float(norm(log.u).max()), 0.01, REFERENCE)
-    log = simulate(FINE, op.params, QUIET._replace(q_hat=ZERO, w_hat=ZERO), KEY, ticks=1200)
+    log = simulate(FINE, op.params, QUIET._replace(q_hat=zeros(), w_hat=zeros()), KEY, ticks=1200)
     report.check("observer from zero: |xi(0)|", 1.514188, float(log.xi[0]), 1e-6, REFERENCE)
     report.check("observer from zero: last above sigma [s]", 8.86, last_outside(log.xi, 0.01, 0.01), 0.02, REFERENCE)
     log = simulate(op.system, op.params._replace(eps=0.00304), QUIET, KEY, ticks=601)
@@ -125,44 +134,29 @@ def nominal(report) -> None:
     report.relative(name, [0.0119, 0.0119], [float(log.xi[2490]), float(log.xi[-1])], 0.02, "reference")
 
 
-def marked(ax, ylabel: str) -> None:
-    """The paper's time axis with both fault onsets."""
-    for t, text in ((150, "gyro fault"), (250, "star-sensor fault")):
-        ax.axvline(t, color="0.5", linestyle=":")
-        ax.annotate(
-            text,
-            (t, 0.97),
-            xycoords=("data", "axes fraction"),
-            xytext=(4, 0),
-            textcoords="offset points",
-            va="top",
-            color="0.3",
-        )
-    ax.set(xlabel="time [s]", ylabel=ylabel, xlim=(0, 350))
-
-
 def figures(report) -> None:
     """Figures 1-3 of the paper, one run."""
-    log = rerun(op.system, op.params, batch(op.scenario, 1), KEY, 0, ticks=3500)
-    t = op.DT * np.arange(3500)
-    fig, ax = plt.subplots(figsize=(7, 3.5))
-    ax.semilogy(t, log.xi, linewidth=0.6, label=r"residual norm $|\xi|$")
-    ax.axhline(op.params.sigma, color="C1", linestyle="--", label=r"threshold $\sigma$ = 0.01")
-    marked(ax, r"$|\xi|$ [MRP, rad/s]")
-    ax.set_ylim(3e-4, 0.5)
+    log = simulate(op.system, op.params, op.scenario, noise_of(op.system, KEY, 0, ticks=3500), ticks=3500)
+    fig, ax = plt.subplots(figsize=(7, 3.5), layout="constrained")
+    ax.semilogy(log.t, log.xi, LINES[0], color=COLOURS[0], linewidth=0.6, label=r"residual norm $|\xi|$")
+    ax.axhline(op.params.sigma, color=COLOURS[1], linestyle=LINES[1], label=r"threshold $\sigma$ = 0.01")
+    ax.set(ylabel=r"$|\xi|$ [1, rad/s]", ylim=(3e-4, 0.5))
+    mark_onsets(ax)
     ax.legend(loc="upper left")
     report.figure("fig1_residual", fig)
-    for name, error, ylabel in (
-        ("fig2_attitude_error", log.e_q, "attitude error [MRP]"),
+    for name, error, label in (
+        ("fig2_attitude_error", log.e_q, "attitude error, MRP [1]"),
         ("fig3_rate_error", log.e_w, "rate error [rad/s]"),
     ):
-        fig, ax = plt.subplots(figsize=(7, 3.5))
-        for axis, values in zip("xyz", error):
-            ax.plot(t, values, linewidth=0.6, label=axis)
-        marked(ax, ylabel)
-        limit = 1.3 * max(float(np.abs(a[t > 150]).max()) for a in error)
-        ax.set_ylim(-limit, limit)
-        ax.legend(loc="lower left", ncols=3, title="body axis; the slew of the first 10 s leaves the frame")
+        fig, axes = plt.subplots(3, sharex=True, sharey=True, figsize=(7, 5), layout="constrained")
+        limit = 1.3 * max(float(np.abs(a[log.t > 150]).max()) for a in error)
+        for ax, axis, values, colour in zip(axes, "xyz", error, COLOURS):
+            ax.plot(log.t, values, color=colour, linewidth=0.6)
+            mark_onsets(ax, named=axis == "x")
+            ax.set(ylabel=axis, ylim=(-limit, limit))
+        note = "the slew of the first 10 s leaves the frame"
+        axes[0].annotate(note, (0.05, 0.97), xycoords="axes fraction", va="top", fontsize="small")
+        fig.supylabel(label, fontsize="medium")
         report.figure(name, fig)
     alarms = np.asarray(log.alarm)
     report.check(
@@ -172,6 +166,20 @@ def figures(report) -> None:
         0,
         "words on Fig. 1",
     )
+
+
+def mark_onsets(ax, named: bool = True) -> None:
+    """The paper's time axis with both fault onsets, dotted."""
+    for t, text in ((150, "gyro fault"), (250, "star-sensor fault")):
+        ax.axvline(t, color=GREY, linestyle=":")
+        if named:
+            ax.annotate(
+                text, (t, 0.97), xycoords=("data", "axes fraction"), xytext=(4, 0),
+                textcoords="offset points", va="top", fontsize="small",
+            )  # fmt: skip
+    ax.set(xlim=(0, 350))
+    if ax.get_subplotspec().is_last_row():
+        ax.set_xlabel("time [s]")
 
 
 def windows(params, scenario, now, log):
@@ -184,6 +192,7 @@ def windows(params, scenario, now, log):
 def monte_carlo(report) -> None:
     """The table of windows for both values of eps, random held faults of 0.03 per axis."""
     n = 64 if report.quick else 256
+    scenarios = jax.vmap(lambda _: op.scenario)(np.arange(n))
     table = {
         0.1: [(0.001288, 0.0, 0.0001561, 0.001202), (0.05292, 0.992, 0.003395, 0.02626), (0.07514, 1.0, 0.01072, 0.08262)],
         0.00304: [(0.001288, 0.0, 0.001184, 0.009374), (0.05292, 0.992, 0.001284, 0.01006), (0.07514, 1.0, 0.07812, 0.6194)],
@@ -191,7 +200,7 @@ def monte_carlo(report) -> None:
     for eps, rows in table.items():
         system = op.system._replace(substeps=4 if eps == 0.1 else 8)
         params = op.params._replace(eps=eps)
-        swept = sweep(system, params, batch(op.scenario, n), KEY, ticks=3500, score=windows)
+        swept = sweep(system, params, scenarios, KEY, ticks=3500, score=windows)
         for span, (xi, share, q, w), got in zip(("60-150", "150-250", "250-350"), rows, swept):
             rms = [float(np.sqrt(a.mean())) for a in (got[0], got[2], got[3])]
             name = f"eps {eps}, {span} s: rms |xi|, |e_q|, |e_w|"
@@ -204,19 +213,24 @@ def monte_carlo(report) -> None:
 def fault_sizes(report) -> None:
     """Detection delay and miss share over the size of held random faults and of constant biases."""
     runs = 16 if report.quick else 128
-    sizes = {"gyro": np.geomspace(0.003, 0.1, 8), "star": np.geomspace(0.003, 0.1, 8)}
-    cases = [(sensor, kind, size) for sensor in sizes for kind in ("random", "bias") for size in sizes[sensor]]
+    sizes = np.geomspace(0.003, 0.1, 8)
+    cases = [(sensor, kind, size) for sensor in ("gyro", "star") for kind in ("random", "bias") for size in sizes]
     cases += [("gyro", "bias", 0.0)] * 8
-    case = np.repeat(np.arange(len(cases)), runs)
-    column = lambda sensor, kind: np.array([s if (a, b) == (sensor, kind) else 0.0 for a, b, s in cases])[case]
-    n = len(case)
+    n = len(cases) * runs
     onset = np.random.default_rng(3).uniform(30, 40, n)
-    scenarios = batch(QUIET._replace(std_q=op.STD_Q, std_w=op.STD_W), n)
-    fault = lambda sensor: on_axes(
-        batch(Fault(), n)._replace(onset=onset, random=column(sensor, "random"), bias=column(sensor, "bias"))
+
+    def column(sensor, kind):
+        """The size of this kind of fault in every scenario, (n,)."""
+        return np.repeat([size if case == [sensor, kind] else 0.0 for *case, size in cases], runs)
+
+    def drawn(onset, size):
+        fault = lambda sensor: on_axes(Fault(onset, random=size[sensor, "random"], bias=size[sensor, "bias"]))
+        return op.scenario._replace(star=fault("star"), gyro=fault("gyro"))
+
+    size = {(sensor, kind): column(sensor, kind) for sensor in ("gyro", "star") for kind in ("random", "bias")}
+    swept = sweep(
+        op.system, op.params, jax.vmap(drawn)(onset, size), jax.random.fold_in(KEY, 1), ticks=700, score=op.score
     )
-    scenarios = scenarios._replace(star=fault("star"), gyro=fault("gyro"))
-    swept = sweep(op.system, op.params, scenarios, jax.random.fold_in(KEY, 1), ticks=700, score=op.score)
     by_case = jax.tree.map(lambda a: a.reshape(len(cases), runs), swept)
     report.check("fault-size sweep: share of finite runs", 1, swept.ok.mean(), 0, f"{n} scenarios")
     chance = np.isfinite(by_case.delay[-8:])
@@ -225,29 +239,29 @@ def fault_sizes(report) -> None:
         f"chance level, no fault: alarm within 30-40 s in {chance.mean():.4f} of runs (95 %: {low:.4f} to {high:.4f})"
     )
     fig, axes = plt.subplots(2, 2, figsize=(9, 6), sharex=True, sharey="row", layout="constrained")
-    for j, sensor in enumerate(("gyro", "star")):
+    for j, (sensor, unit) in enumerate((("gyro", "rad/s"), ("star", "1, MRP"))):
+        found_ax, miss_ax = axes[:, j]
         for i, (kind, label) in enumerate((("random", "random, held"), ("bias", "constant bias"))):
             rows = [k for k, c in enumerate(cases[:-8]) if c[:2] == (sensor, kind)]
-            size = np.array([cases[k][2] for k in rows])
-            delay = by_case.delay[rows]
+            delay, miss = by_case.delay[rows], by_case.miss[rows]
             found = np.isfinite(delay).sum(1)
-            share = np.array([interval(int(f), runs) for f in found])
-            miss = by_case.miss[rows]
-            axes[0, j].plot(size, found / runs, "os"[i] + "-", color=f"C{i}", label=label)
-            axes[0, j].fill_between(size, share[:, 0], share[:, 1], color=f"C{i}", alpha=0.2)
-            axes[1, j].plot(size, miss.mean(1), "os"[i] + "-", color=f"C{i}", label=label)
-            text = "  ".join(f"{s:.3g}: {np.median(d):.3g} s" for s, d in zip(size, delay))
+            low, high = np.array([interval(int(f), runs) for f in found]).T
+            # the first larger and hollow: seen where both lie on one line
+            style = dict(linestyle=LINES[i], color=COLOURS[i], marker=MARKS[i])
+            style |= (dict(markersize=9, fillstyle="none"), dict(markersize=5))[i]
+            found_ax.plot(sizes, found / runs, label=label, **style)
+            found_ax.fill_between(
+                sizes, low, high, color=COLOURS[i], alpha=0.2, linewidth=0, label=f"{label}: 95 % interval"
+            )
+            miss_ax.plot(sizes, miss.mean(1), **style)
+            text = "  ".join(f"{s:.3g}: {np.median(d):.3g} s" for s, d in zip(sizes, delay))
             report.note(f"{sensor}, {label}: size: median delay (inf: not found)  {text}")
-        axes[0, j].axhline(chance.mean(), color="0.5", linestyle=":", label="chance level")
-        axes[0, j].set(
-            title=f"{sensor} fault".replace("star", "star-sensor"), ylabel="share of faults detected" if j == 0 else ""
-        )
-        axes[1, j].set(
-            xlabel=f"size per axis [{'rad/s' if sensor == 'gyro' else 'MRP'}]",
-            xscale="log",
-            ylabel="share of faulty time without alarm" if j == 0 else "",
-        )
-        axes[0, j].legend()
+        found_ax.axhline(chance.mean(), color=GREY, linestyle=":", label="chance level")
+        found_ax.set(title=f"{sensor} fault".replace("star", "star-sensor"))
+        miss_ax.set(xlabel=f"size per axis [{unit}]", xscale="log")
+    axes[0, 0].set_ylabel("share of faults detected [1]")
+    axes[1, 0].set_ylabel("share of faulty time without alarm [1]")
+    axes[0, 1].legend(loc="center right")
     report.figure("fault_sizes", fig)
     loud = by_case.miss[[k for k, c in enumerate(cases) if c[0] == "gyro" and c[1] == "random" and c[2] > 0.09]]
     report.within("miss share, random gyro fault of 0.1 rad/s", None, 0.01, loud.mean(), "ten times the threshold")

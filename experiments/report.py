@@ -13,21 +13,16 @@ import numpy as np
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-from jaxatt.detection import interval as interval  # beside the checks, for the experiments
+from jaxatt.evaluation import interval as interval
 
 
 class Report:
-    """Collects checks and figures of the experiments of one run. quick: shrink Monte Carlo sizes only."""
+    """Collects checks and figures of one experiment. quick: shrink Monte Carlo sizes only."""
 
-    def __init__(self, out: Path, quick: bool):
-        self.out, self.quick = Path(out), quick
+    def __init__(self, out: Path, quick: bool, experiment: str):
+        self.out, self.quick, self.experiment = Path(out), quick, experiment
         self.checks: list[dict] = []
         self.figures: list[str] = []
-        self.experiment = ""
-
-    def start(self, experiment: str) -> None:
-        """Print the head of an experiment's table."""
-        self.experiment = experiment
         print(f"\n{experiment}\n{'check':58} {'paper or reference':>26} {'ours':>26} {'tolerance':>12}  ok", flush=True)
 
     def check(self, name: str, expected, measured, tolerance, source: str) -> bool:
@@ -58,16 +53,9 @@ class Report:
         plt.close(fig)
         self.figures.append(str(path.relative_to(self.out)))
 
-    def write(self) -> bool:
-        """Write metrics.json; return whether every check is ok."""
-        versions = {"python": platform.python_version(), "jax": jax.__version__, "numpy": np.__version__}
-        self.out.mkdir(parents=True, exist_ok=True)
-        metrics = {"checks": self.checks, "figures": self.figures, "versions": versions}
-        (self.out / "metrics.json").write_text(json.dumps(metrics, indent=1) + "\n")
-        bad = [c["name"] for c in self.checks if not c["ok"]]
-        print(f"\n{len(self.checks) - len(bad)} of {len(self.checks)} checks ok, {len(self.figures)} figures", end="")
-        print(f"; written to {self.out}" + "".join(f"\nnot ok: {name}" for name in bad))
-        return not bad
+    def found(self) -> dict:
+        """Checks and figures as plain values, for `written`."""
+        return {"checks": self.checks, "figures": self.figures}
 
     def _add(self, name, expected, measured, tolerance, source, ok) -> bool:
         name = f"{self.experiment}: {name}"
@@ -78,6 +66,19 @@ class Report:
         row = f"{name.split(': ', 1)[1]:58} {_short(expected):>26} {_short(measured):>26} {_short(tolerance):>12}"
         print(row, " ok" if ok else " NOT OK", flush=True)
         return ok
+
+
+def written(out: Path, parts: list[dict]) -> bool:
+    """Write metrics.json of what several reports found, and print the sum; whether every check is ok."""
+    checks, figures = ([item for part in parts for item in part[kind]] for kind in ("checks", "figures"))
+    versions = {"python": platform.python_version(), "jax": jax.__version__, "numpy": np.__version__}
+    out.mkdir(parents=True, exist_ok=True)
+    metrics = {"checks": checks, "figures": figures, "versions": versions}
+    (out / "metrics.json").write_text(json.dumps(metrics, indent=1) + "\n")
+    bad = [c["name"] for c in checks if not c["ok"]]
+    print(f"\n{len(checks) - len(bad)} of {len(checks)} checks ok, {len(figures)} figures; written to {out}", end="")
+    print("".join(f"\nnot ok: {name}" for name in bad))
+    return not bad
 
 
 def _plain(a):

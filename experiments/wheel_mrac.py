@@ -18,19 +18,23 @@ import optax
 import jaxatt
 from experiments.report import Report
 from jaxatt import scores
-from jaxatt.bodies import Wheel, wheel_acceleration
+from jaxatt.compiling import jitted
 from jaxatt.controllers import Adaptation, Mrac, mrac_input, mrac_sampled_bound, mrac_step
-from jaxatt.estimators import LeastSquares, least_squares
 from jaxatt.faults import Fault
-from jaxatt.study import batch, varied
-from jaxatt.systems import wheel_mrac as wm
+from jaxatt.loops import wheel_mrac as wm
+from jaxatt.observers import LeastSquares, least_squares
+from jaxatt.plot import COLOURS, GREY, LINES, MARKS
+from jaxatt.sweeping import varied
+from jaxatt.wheels import Wheel, wheel_acceleration
 
 TICKS = 4501  # 0 to 90 s
 times = np.arange(TICKS) * wm.DT  # [s]
 LATE = times >= wm.START_UP
 WINDOWS = [(times >= a) & (times < b) for a, b in wm.WINDOWS]
 QUIET = wm.scenario._replace(noise=0.0)
-BLUE, ORANGE, GREEN, PINK, GREY = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#777777"  # colour-blind safe
+# The paper's hardware, as far as its words go: low-speed friction, a quiet sensor, a sampled slow law (choice 7).
+HARDWARE = wm.Params(J_hat=5.421, a_r=0.5, a_y=0.0, law=Adaptation(gamma=1e-8), ope=0.0)
+HARDWARE_DAY = wm.Scenario(wheel=Wheel(friction=25000.0), noise=0.01)
 
 
 def run(report: Report) -> None:
@@ -47,58 +51,69 @@ def run(report: Report) -> None:
 
 
 def uniform(seeds, amplitude=0.05):
-    """NumPy's uniform noise, one lane for each seed, as a noise array."""
+    """NumPy's uniform noise, one run for each seed, as noise arrays (runs, ticks, 3)."""
     v = [np.random.default_rng(seed).uniform(-amplitude, amplitude, TICKS) for seed in seeds]
-    return wm.normals_of(np.stack(v, axis=-1), amplitude)
+    return normals_of(np.stack(v), amplitude)
+
+
+def normals_of(v, amplitude):
+    """The noise array with which `simulate` adds the attitude noise v to the readings.
+
+    v: [deg] uniform noise in (-amplitude, amplitude), shape (..., ticks), runs first; the scenario's noise must be that
+    amplitude. Returns (..., ticks, 3): wheel speed and drive stay without noise.
+    """
+    normal = np.sqrt(2) * jax.lax.erf_inv(jnp.asarray(v / amplitude))
+    return jnp.stack([normal, 0 * normal, 0 * normal], axis=-1)
 
 
 def runs(pairs, noise, system=wm.system):
-    """Logs of several (params, scenario), one lane each; noise of one lane serves them all."""
+    """Logs (runs, ticks) of several (params, scenario) with noise (runs, ticks, 3), or (1, ticks, 3) for all of them."""
     pairs = jax.tree.map(lambda *leaves: np.array(leaves, float), *pairs)
-    noise = jnp.broadcast_to(noise, (*noise.shape[:2], len(pairs[0].K)))
-    return jax.tree.map(np.asarray, jaxatt.simulate(varied(system), (), pairs, noise, ticks=TICKS))
+    noise = jnp.broadcast_to(noise, (len(pairs[0].K), *noise.shape[1:]))
+    run = jax.vmap(lambda p, s, noise: jaxatt.simulate(system, p, s, noise, ticks=TICKS))
+    return jax.tree.map(np.asarray, jitted(run)(*pairs, noise))
 
 
 def rms(a):
-    return np.sqrt(np.mean(np.square(a), axis=0))
+    return np.sqrt(np.mean(np.square(a), axis=-1))
 
 
 def peak(a):
-    return np.abs(a).max(axis=0)
+    return np.abs(a).max(axis=-1)
 
 
 def paper_case(report: Report):
     """Without and with noise, MRAC only and with estimation; the logs of seed 1."""
     log = runs([(wm.mrac_only, QUIET), (wm.params, QUIET)], uniform([1]))
     report.check("noise-free: max error MRAC, +OPE [deg]", [0.21402, 0.03614], peak(log.error), 1e-4, "reference")
-    ends = [log.a_r[-1, 0], log.a_y[-1, 0]]
+    ends = [log.a_r[0, -1], log.a_y[0, -1]]
     report.check("noise-free: a_r, a_y at 90 s", [0.70477, -0.20253], ends, 1e-4, "reference")
-    report.check("noise-free: J_hat at 20, 90 s", [5.42091, 5.42100], log.J_hat[[1000, 4500], 1], 1e-4, "reference")
+    report.check("noise-free: J_hat at 20, 90 s", [5.42091, 5.42100], log.J_hat[1, [1000, 4500]], 1e-4, "reference")
     n = 8 if report.quick else 64
     noise = uniform(range(1, n + 1))
     pairs = [(wm.mrac_only, wm.scenario)] * n + [(wm.params, wm.scenario)] * n
-    log = runs(pairs, jnp.concatenate([noise, noise], axis=-1))
-    alone, both = (jax.tree.map(lambda a, s=s: a[:, s], log) for s in (slice(None, n), slice(n, None)))
+    log = runs(pairs, jnp.concatenate([noise, noise]))
+    alone, both = (jax.tree.map(lambda a, s=s: a[s], log) for s in (slice(None, n), slice(n, None)))
     report.within("Fig. 4a: max measured error [deg], all seeds", 0.255, 0.272, peak(alone.measured), "reference")
-    ratio = peak(both.measured[LATE]) / peak(alone.measured[LATE])
+    ratio = peak(both.measured[:, LATE]) / peak(alone.measured[:, LATE])
     report.within("Fig. 7a: ratio of max errors after 10 s, seed 1", 0.22, 0.25, ratio[0], "reference, paper 1/5")
     report.within("  the same, median of all seeds", 0.22, 0.25, np.median(ratio), "reference")
     report.note(
         f"ratio over {n} seeds: {ratio.min():.3f} to {ratio.max():.3f}, "
         f"{np.mean((ratio >= 0.22) & (ratio <= 0.25)):.0%} within 0.22 to 0.25: a maximum of noise has a tail"
     )
-    ratio = rms(both.measured[LATE]) / rms(alone.measured[LATE])
+    ratio = rms(both.measured[:, LATE]) / rms(alone.measured[:, LATE])
     report.check("  ratio of rms errors after 10 s, seed 1", 0.25, ratio[0], 0.01, "reference")
     report.check("  the same, median of all seeds", 0.25, np.median(ratio), 0.01, "reference")
     report.note(f"rms ratio over {n} seeds: {ratio.min():.3f} to {ratio.max():.3f}")
     ratio = peak(both.error) / peak(alone.error)
     report.within("  ratio of max true errors, all seeds", 1 / 6.5, 1 / 5.5, ratio, "reference (1/6.0); paper 1/5")
-    report.check("Fig. 8b: J_hat at 90 s, all seeds", 5.4210, both.J_hat[-1], 2e-4, "reference")
-    changes = [np.median(rms(np.diff(a.r[LATE], axis=0))) for a in (alone, both)]
+    report.check("Fig. 8b: J_hat at 90 s, all seeds", 5.4210, both.J_hat[:, -1], 2e-4, "reference")
+    changes = [np.median(rms(np.diff(a.r[:, LATE]))) for a in (alone, both)]
     report.check("Figs. 4b, 7b: rms step of r, median [deg/s]", [287, 10.5], changes, [10, 0.2], "reference")
-    ends = [alone.a_r[-1, 0], alone.a_y[-1, 0]]
+    ends = [alone.a_r[0, -1], alone.a_y[0, -1]]
     report.check("Fig. 5: a_r, a_y at 90 s, seed 1", [0.670, -0.169], ends, 1e-3, "reference")
-    return jax.tree.map(lambda a: a[:, 0], alone), jax.tree.map(lambda a: a[:, 0], both)
+    return jax.tree.map(lambda a: a[0], alone), jax.tree.map(lambda a: a[0], both)
 
 
 def least_squares_in_closed_form(report: Report):
@@ -140,18 +155,18 @@ def sampled_adaptation(report: Report):
     log = runs(pairs, uniform([1]), wm.sampled)
     first = lambda on: times[np.argmax(on)]
     report.check(
-        "  diverges at gamma 1e-6, 1e-7, 3e-8, 1e-8", [1, 0, 0, 0], log.failed[-1].astype(float), 0, "reference"
+        "  diverges at gamma 1e-6, 1e-7, 3e-8, 1e-8", [1, 0, 0, 0], log.failed[:, -1].astype(float), 0, "reference"
     )
-    alarm = first(log.alarm[:, 0] & LATE & (times > 20))
+    alarm = first(log.alarm[0] & LATE & (times > 20))
     report.check("  gamma 1e-6: |y - y_m| > 50 deg/s at [s]", 25.96, alarm, 0.02, "reference")
-    report.note(f"gamma 1e-6: |y| > {wm.RUNAWAY:g} deg/s at {first(log.failed[:, 0]):.2f} s (reference: 38.3 s)")
-    report.check("  gamma 1e-7: a_r, a_y run off to", [2.1, -1.6], [log.a_r[-1, 1], log.a_y[-1, 1]], 0.05, "reference")
+    report.note(f"gamma 1e-6: |y| > {wm.RUNAWAY:g} deg/s at {first(log.failed[0]):.2f} s (reference: 38.3 s)")
+    report.check("  gamma 1e-7: a_r, a_y run off to", [2.1, -1.6], [log.a_r[1, -1], log.a_y[1, -1]], 0.05, "reference")
     report.check("  gamma 1e-7: max error [deg]", 0.31, peak(log.error)[1], 0.005, "reference")
 
 
 def hardware(report: Report):
     """What a wheel that sticks at low speed does to MRAC (docs/loops/wheel_mrac.md), in one batch but for the continuous law."""
-    base, scenario = wm.hardware_params, wm.hardware_scenario
+    base, scenario = HARDWARE, HARDWARE_DAY
     with_wheel = lambda wheel: (base, scenario._replace(wheel=wheel))
     free = scenario._replace(wheel=Wheel())
     table = {
@@ -170,28 +185,28 @@ def hardware(report: Report):
     }  # fmt: skip
     noise = uniform([1], 0.01)
     log = runs([pair for pair, _, _ in table.values()], noise, wm.sampled)
-    peaks = np.stack([peak(log.error[w]) for w in WINDOWS], axis=-1)
-    spans = np.stack([np.ptp((log.r - log.r_ideal)[w], axis=0) for w in WINDOWS], axis=-1)
+    peaks = np.stack([peak(log.error[:, w]) for w in WINDOWS], axis=-1)
+    spans = np.stack([np.ptp((log.r - log.r_ideal)[:, w], axis=1) for w in WINDOWS], axis=-1)
     for i, (name, (_, errors, swings)) in enumerate(table.items()):
         # the gate's edge is smoothed here, a hard one in the reference
         tolerance = 0.01 if name.startswith("gate") else 6e-4
         report.check(f"{name}: max error in 3 windows", errors, peaks[i], tolerance, "reference [deg]")
         if swings:
             report.check("  peak to peak of r - ideal", swings, spans[i], 1.0, "reference [deg/s]")
-    continuous = runs([(base._replace(law=Adaptation()), scenario)], noise, wm.loop(substeps=10))
-    found = [peak(continuous.error[w])[0] for w in WINDOWS]
+    continuous = runs([(base._replace(law=Adaptation()), scenario)], noise, wm.system_of(substeps=10))
+    found = [peak(continuous.error[0, w]) for w in WINDOWS]
     report.check("friction, continuous, gamma 1e-6: max error", [0.078, 0.013, 0.021], found, 6e-4, "reference [deg]")
     report.within("hardware: max error [deg]", None, 0.25, peaks[0].max(), "reference, paper Fig. 10a")
     report.within("  swings at the ends over the middle", 3, None, spans[0, [0, 2]] / spans[0, 1], "reference")
-    means = [np.abs(log.measured[:, i]).mean() for i in (0, 4)]
+    means = [np.abs(log.measured[i]).mean() for i in (0, 4)]
     report.check("  mean measured error, J_hat exact, 5 [deg]", [0.0378, 0.1125], means, 2e-4, "reference")
-    one = jax.tree.map(lambda a: a[:, 0], log)
+    one = jax.tree.map(lambda a: a[0], log)
     report.figure("fig09_hardware_attitude", attitude_figure(one, "Hardware preset: MRAC only (Fig. 9)"))
     report.figure("fig10_hardware_error", error_figure(one, "Hardware preset: MRAC only (Fig. 10)"))
     report.figure("fig11_hardware_parameters", parameter_figure(one, "Hardware preset: MRAC only (Fig. 11)"))
     fig, axes = plt.subplots(len(table) // 2, 2, figsize=(10, 10), sharex=True, sharey=True, layout="constrained")
     for i, (ax, name) in enumerate(zip(axes.T.flat, table)):
-        ax.plot(times, log.error[:, i], color=BLUE, lw=0.8)
+        ax.plot(times, log.error[i], color=COLOURS[0], lw=0.8)
         ax.set(title=name)
         ax.grid(alpha=0.3)
     fig.supxlabel("time [s]")
@@ -220,12 +235,12 @@ def loop_choice(report: Report):
         "starts, K = 5": [(alone._replace(K=5.0, a_r=r, a_y=y), wm.scenario) for r, y in starts],
     }
     edges = np.cumsum([0, *map(len, groups.values())])
-    noise = jnp.repeat(uniform([1]), edges[-1], axis=-1)
+    noise = jnp.repeat(uniform([1]), edges[-1], axis=0)
     gaussian = slice(edges[7], edges[8])
     draws = np.random.default_rng(1).standard_normal(TICKS)
-    noise = noise.at[:, 0, gaussian].set(draws[:, None])
+    noise = noise.at[gaussian, :, 0].set(draws)
     log = runs([pair for group in groups.values() for pair in group], noise)
-    part = {k: jax.tree.map(lambda a, i=i, j=j: a[:, i:j], log) for k, (i, j) in zip(groups, pairwise(edges))}
+    part = {k: jax.tree.map(lambda a, i=i, j=j: a[i:j], log) for k, (i, j) in zip(groups, pairwise(edges))}
     true = {k: peak(v.error) for k, v in part.items()}
     measured = {k: peak(v.measured) for k, v in part.items()}
     half = 6e-4  # of the last digit given, and a little
@@ -242,43 +257,40 @@ def loop_choice(report: Report):
         "loop: gains per rad, K = 1, 5, 10", [1.116, 0.238, 0.292], true["alone, rad"], half, "reference [deg]"
     )
     report.check("  +OPE", [1.106, 0.221, 0.313], true["both, rad"], half, "reference [deg]")
-    report.check("  +OPE, K = 1: J_hat at 20 s", 5.258, part["both, rad"].J_hat[1000, 0], half, "reference")
+    report.check("  +OPE, K = 1: J_hat at 20 s", 5.258, part["both, rad"].J_hat[0, 1000], half, "reference")
     report.check("loop: estimator on differenced attitude", 0.268, true["rates"][0], half, "reference [deg]")
     gauss = measured["gaussian"]
     report.check("loop: Gaussian noise, std 0.05/3, 0.05", [0.259, 0.355], gauss[[0, 2]], half, source)
     report.check("  std 0.05, +OPE", 0.19, gauss[3], 0.006, source)
-    late = peak(part["exact J"].measured[LATE])
+    late = peak(part["exact J"].measured[:, LATE])
     report.check("loop: exact J, K = 1, after 10 s", 0.065, late[0], 1e-3, "reference [deg]")
     report.relative("  K = 20, 40, 60, 80, 90", [0.09, 0.117, 0.17, 0.21, 0.31], late[1:], 0.06, "reference [deg]")
-    ends = np.stack([part["starts"].a_r[-1], part["starts"].a_y[-1]], axis=-1)
+    ends = ends_quiet = np.stack([part["starts"].a_r[:, -1], part["starts"].a_y[:, -1]], axis=-1)
     expected = [[0.7048, -0.2025], [0.7887, -0.2855], [0.2556, 0.2417], [0.8531, -0.3492]]
     report.check("parameters at 90 s from 4 starts", np.ravel(expected), ends.ravel(), 1e-4, "reference")
     report.within("  their sums", 0.497, 0.504, ends.sum(axis=-1), "reference")
-    ends = np.stack([part["starts, K = 5"].a_r[-1], part["starts, K = 5"].a_y[-1]], axis=-1)
+    ends = np.stack([part["starts, K = 5"].a_r[:, -1], part["starts, K = 5"].a_y[:, -1]], axis=-1)
     report.check("  with noise at K = 5 all reach (0.5, 0)", [0.5, 0] * 4, ends.ravel(), 2e-3, "reference")
     fig, (left, right) = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
-    for key, label, colour, marker in (("alone", "MRAC only", BLUE, "o"), ("both", "MRAC + estimation", ORANGE, "s")):
-        left.loglog(gains, true[key], color=colour, marker=marker, label=f"{label}, feed-forward")
-        left.loglog(
-            free_gains, true[f"{key}, no ff"], color=colour, marker=marker, ls=":", label=f"{label}, no feed-forward"
-        )
-        left.loglog(
-            rad_gains, true[f"{key}, rad"], color=colour, marker=marker, ls="--", label=f"{label}, gains per rad"
-        )
+    loops = (
+        ("", gains, "feed-forward"),
+        (", no ff", free_gains, "no feed-forward"),
+        (", rad", rad_gains, "gains per rad"),
+    )
+    for i, (key, label) in enumerate((("alone", "MRAC only"), ("both", "MRAC + estimation"))):
+        for j, (kind, at, words) in enumerate(loops):
+            look = dict(color=COLOURS[i], marker=MARKS[i], ls=LINES[j], fillstyle="full" if i else "none")
+            left.loglog(at, true[f"{key}{kind}"], label=f"{label}, {words}", **look)
     left.axhline(0.25, color=GREY, lw=0.8)
     left.annotate("paper: about 0.25", (1.2, 0.265), color=GREY, fontsize=8)
-    left.set(
-        xlabel="outer-loop gain K [1/s]",
-        ylabel="max true error [deg]",
-        title="Which loop fits the paper",
-        ylim=(6e-4, 4),
-    )
+    left.set(xlabel="outer-loop gain K [1/s]", ylabel="max true error [deg]", title="Which loop fits the paper",
+             ylim=(6e-4, 4))  # fmt: skip
     left.legend(fontsize=7, loc="lower left", handlelength=4)
-    for (r, y), a, b, colour in zip(starts, part["starts"].a_r.T, part["starts"].a_y.T, (BLUE, ORANGE, GREEN, PINK)):
-        right.plot(a, b, color=colour, label=f"from ({r:g}, {y:g})")
-        right.plot(a[-1], b[-1], "ko", ms=3)
+    for i, ((r, y), a, b) in enumerate(zip(starts, part["starts"].a_r, part["starts"].a_y)):
+        right.plot(a, b, color=COLOURS[2], ls=LINES[i], label=f"from ({r:g}, {y:g})")
+    right.plot(*ends_quiet.T, "ko", ms=3, label="after 90 s")
     s = np.array([0.2, 1.1])
-    right.plot(s, 0.5 - s, color=GREY, ls="--", lw=0.8, label="$a_r + a_y = 0.5$")
+    right.plot(s, 0.5 - s, color=GREY, lw=0.8, label="$a_r + a_y = 0.5$")
     right.plot(0.5, 0, "k*", ms=9, label="ideal (0.5, 0)")
     right.set(xlabel="$a_r$ [1]", ylabel="$a_y$ [1]", title="Only the sum of the parameters converges")
     right.legend(fontsize=7)
@@ -295,27 +307,27 @@ def loss_of_effectiveness(report: Report):
         15.0: ([205.7, 634.9, 1411.8, 2370.3], [0.01395, 0.01986, 0.05897, 0.16528], [0, 0, 0.66, 2.22]),
     }
     pairs = [(wm.params, wm.scenario._replace(drive=Fault(onset=onset, scale=s))) for onset in expected for s in scales]
-    log = runs(pairs, uniform([1]), wm.loop(substeps=8))
+    log = runs(pairs, uniform([1]), wm.system_of(substeps=8))
     fig, axes = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
     for i, (onset, (residuals, errors, settling)) in enumerate(expected.items()):
-        here = jax.tree.map(lambda a, i=i: a[times >= onset, 5 * i : 5 * i + 5], log)  # noqa: B023
+        here = jax.tree.map(lambda a, i=i: a[5 * i : 5 * i + 5, times >= onset], log)  # noqa: B023
         since = times[times >= onset] - onset
         name = f"b_p falls to 0.8, 0.5, 0.2, 0.05 at {onset:g} s"
         report.relative(f"{name}: residual", residuals, peak(here.residual)[1:], 0.02, "reference [deg/s]")
         report.relative("  max true error", errors, peak(here.error)[1:], 0.02, "reference [deg]")
         outside = np.abs(here.error) > 0.05
-        last = [since[o][-1] if o.any() else 0.0 for o in outside.T[1:]]
+        last = [since[o][-1] if o.any() else 0.0 for o in outside[1:]]
         report.check("  settled to 0.05 deg after", settling, last, 0.011, "reference [s]")
-        delays = [since[a][0] if a.any() else np.inf for a in here.alarm.T]
+        delays = [since[a][0] if a.any() else np.inf for a in here.alarm]
         report.check("  alarm after", [0.02] * 4, delays[1:], 1e-9, "reference [s]")
-        report.check("  alarms without a fault", 0, int(here.alarm[:, 0].sum()), 0, "reference")
-        sums = (here.a_r + here.a_y)[-1]
+        report.check("  alarms without a fault", 0, int(here.alarm[0].sum()), 0, "reference")
+        sums = (here.a_r + here.a_y)[:, -1]
         report.relative("  effectiveness 0.5 / (a_r + a_y) at the end", scales, 0.5 / sums, 0.02, "reference: DC gain")
         report.relative("  a_r + a_y at the end", [0.62660, 0.99985, 2.4942, 9.9702], sums[1:], 0.02, "reference")
-        for s, residual, colour in zip(scales[1:], here.residual.T[1:], (BLUE, ORANGE, GREEN, PINK)):
-            axes[i].semilogy(since[:126], np.abs(residual[:126]), color=colour, lw=1, label=f"$s$ = {s:g}")
-        axes[i].axhline(50, color=GREY, lw=0.8)
-        axes[i].annotate("alarm", (2.2, 58), color=GREY, fontsize=8)
+        for j, (s, residual) in enumerate(zip(scales[1:], here.residual[1:])):
+            look = dict(color=COLOURS[j], ls=LINES[j], lw=1, label=f"$s$ = {s:g}")
+            axes[i].semilogy(since[:126], np.abs(residual[:126]), **look)
+        axes[i].axhline(50, color=GREY, lw=0.8, label="alarm above it")
         axes[i].set(xlabel=f"time since the fault at {onset:g} s [s]", ylabel="$|y - y_m|$ [deg/s]", ylim=(1, 1e4))
         axes[i].legend(fontsize=8)
         axes[i].grid(alpha=0.3)
@@ -326,18 +338,18 @@ def loss_of_effectiveness(report: Report):
 def friction_growth(report: Report):
     """Friction appears at 60 s; sampled law, estimation on (docs/loops/wheel_mrac.md)."""
     sizes = [1e4, 3e4, 1e5, 3e5]
-    params = wm.hardware_params._replace(J_hat=5.0, ope=1.0)
+    params = HARDWARE._replace(J_hat=5.0, ope=1.0)
     pairs = [
         (params, wm.scenario._replace(wheel=Wheel(creep=max(100.0, F / 300)), friction=Fault(onset=60.0, bias=F)))
         for F in sizes
     ]
     log = runs(pairs, uniform([1]), wm.sampled)
     late = times >= 60
-    delays = np.argmax(log.alarm[late], axis=0) * wm.DT
+    delays = np.argmax(log.alarm[:, late], axis=1) * wm.DT
     report.relative(
         "friction 1e4 ... 3e5 at 60 s: alarm after", [15.38, 13.74, 12.38, 11.38], delays, 0.02, "reference [s]"
     )
-    report.relative("  max error", [0.082, 0.205, 0.473, 0.667], peak(log.error[late]), 0.02, "reference [deg]")
+    report.relative("  max error", [0.082, 0.205, 0.473, 0.667], peak(log.error[:, late]), 0.02, "reference [deg]")
 
 
 def large_sweep(report: Report):
@@ -346,27 +358,26 @@ def large_sweep(report: Report):
     rng = np.random.default_rng(0)
     level = lambda low, high: rng.uniform(low, high, n)
     logarithmic = lambda low, high: np.exp(rng.uniform(np.log(low), np.log(high), n))
-    params, scenarios = batch((wm.params, wm.scenario), n)
-    params = params._replace(
-        J_hat=level(4.0, 7.0),
-        K=logarithmic(0.5, 5.0),
-        law=params.law._replace(gamma=logarithmic(1e-8, 3e-6)),
-        a_r=np.full(n, 0.5),
-        a_y=np.zeros(n),
-        ope=np.arange(n) % 2.0,
-    )
-    scenarios = scenarios._replace(
-        J_z=level(4.0, 7.0),
-        noise=level(0.0, 0.1),
-        wheel=scenarios.wheel._replace(friction=level(0.0, 3e4)),
-        drive=scenarios.drive._replace(onset=level(12.0, 80.0), scale=level(0.05, 1.0)),
-    )
-    system, key = varied(wm.loop(substeps=8)), jax.random.key(0)
+    drawn = dict(
+        J_hat=level(4.0, 7.0), K=logarithmic(0.5, 5.0), gamma=logarithmic(1e-8, 3e-6), ope=np.arange(n) % 2.0,
+        J_z=level(4.0, 7.0), noise=level(0.0, 0.1), friction=level(0.0, 3e4), onset=level(12.0, 80.0), scale=level(0.05, 1.0),
+    )  # fmt: skip
 
-    def score(_, pair, now, log):
-        params, scenario = pair
-        return wm.score(params, scenario, now, log)
+    @jax.vmap
+    def pairs_of(d):
+        law = Adaptation(gamma=d["gamma"])
+        return (
+            wm.params._replace(J_hat=d["J_hat"], K=d["K"], law=law, a_r=0.5, a_y=0.0, ope=d["ope"]),
+            wm.scenario._replace(
+                J_z=d["J_z"],
+                noise=d["noise"],
+                wheel=Wheel(friction=d["friction"]),
+                drive=Fault(onset=d["onset"], scale=d["scale"]),
+            ),
+        )
 
+    params, scenarios = jax.tree.map(np.asarray, pairs_of(drawn))
+    system, key, score = varied(wm.system_of(substeps=8)), jax.random.key(0), varied(wm.score)
     few = jax.tree.map(lambda a: a[: 2 * 128], (params, scenarios))
     jaxatt.sweep(system, (), few, key, ticks=TICKS, score=score)  # compiles
     start, cpu = time.perf_counter(), time.process_time()
@@ -380,7 +391,7 @@ def large_sweep(report: Report):
     estimating = params.ope > 0
     mismatch = np.abs(scenarios.J_z / params.J_hat - 1)
     for name, on in (("MRAC only", ~estimating), ("MRAC + estimation", estimating)):
-        q = np.percentile(got.peak_ill[on], [50, 95])
+        q = np.percentile(got.peak_faulty[on], [50, 95])
         report.note(f"{name}: max true error after the fault, median {q[0]:.3f}, 95 % below {q[1]:.3f} deg")
     close = np.mean(np.abs(got.J_hat / scenarios.J_z - 1)[estimating] < 0.005)
     report.within("  J_hat within 0.5 % at the end, share", 0.99, None, close, "reference, Fig. 8b")
@@ -394,17 +405,19 @@ def large_sweep(report: Report):
                   np.median(got.peak[clear] / law[clear]), "reference")  # fmt: skip
     caught = np.isfinite(got.delay)
     fig, (left, right) = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
-    left.loglog(law[~estimating], got.peak[~estimating], ".", ms=2, color=BLUE, alpha=0.4, label="MRAC only")
-    left.loglog(law[estimating], got.peak[estimating], ".", ms=2, color=ORANGE, alpha=0.4, label="MRAC + estimation")
+    for i, (name, on) in enumerate((("MRAC only", ~estimating), ("MRAC + estimation", estimating))):
+        left.loglog(law[on], got.peak[on], MARKS[i], ms=2, mew=0, color=COLOURS[i], alpha=0.4, label=name)
     left.plot([1e-2, 3], [1e-2, 3], color="k", lw=0.8, label="$|J_z/\\hat J - 1|\\,\\dot\\theta_d/K$")
     left.set(xlabel="error that the inertia's mismatch predicts [deg]", ylabel="max true error [deg]", xlim=(1e-3, 5))
     left.legend(fontsize=8, markerscale=4)
     edges = np.linspace(0.05, 1, 20)
     middle = (edges[1:] + edges[:-1]) / 2
     inside = [(scenarios.drive.scale >= a) & (scenarios.drive.scale < b) for a, b in pairwise(edges)]
-    right.plot(middle, [np.mean(caught[i]) for i in inside], color=BLUE, marker="o", ms=3, label="share with an alarm")
-    right.plot(middle, [np.mean(got.delay[i] <= 0.0401) for i in inside], color=ORANGE, marker="s", ms=3,
-               label="share within two ticks")  # fmt: skip
+    for i, (name, soon) in enumerate(
+        (("share with an alarm", caught), ("share within two ticks", got.delay <= 0.0401)), 2
+    ):
+        look = dict(color=COLOURS[i], ls=LINES[i], marker=MARKS[i], ms=3, label=name)
+        right.plot(middle, [np.mean(soon[here]) for here in inside], **look)
     right.set(xlabel="effectiveness that is left [1]", ylabel="share [1]", ylim=(0, 1.02))
     right.legend(fontsize=8)
     for ax in (left, right):
@@ -415,14 +428,14 @@ def large_sweep(report: Report):
 
 def tuning(report: Report):
     """log K, log gamma, log P0 by gradient; judged on noise, inertias and faults that the search has not seen."""
-    system = wm.loop(substeps=8)
+    system = wm.system_of(substeps=8)
     n = 128
 
     def world(seed):
         rng = np.random.default_rng(seed)
-        scenarios = batch(wm.scenario, n)
-        drive = scenarios.drive._replace(onset=rng.uniform(12, 80, n), scale=rng.choice([1.0, 0.8, 0.5, 0.2], n))
-        return scenarios._replace(J_z=rng.uniform(4.5, 6.5, n), drive=drive)
+        onset, scale, J_z = rng.uniform(12, 80, n), rng.choice([1.0, 0.8, 0.5, 0.2], n), rng.uniform(4.5, 6.5, n)
+        draw = lambda onset, scale, J_z: wm.scenario._replace(J_z=J_z, drive=Fault(onset=onset, scale=scale))
+        return jax.vmap(draw)(onset, scale, J_z)
 
     def score(params, scenario, now, log):  # reference
         return scores.mean(log.error**2 + 1e-8 * log.step**2), scores.mean(log.error**2), scores.mean(log.step**2)
@@ -460,12 +473,11 @@ def tuning(report: Report):
         values = [np.sqrt(f[i].mean()) for f in fresh]
         report.note(f"fresh: rms {name} {values[0]:.4g} -> {values[1]:.4g}")
     fig, (left, right) = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
-    left.semilogy(history.cost, color=BLUE)
-    left.set(xlabel="step", ylabel="cost on the seen scenarios [$10^{-3}$ deg$^2$]", title="Tuning by gradient")
-    for key, colour, style in (("log_K", BLUE, "-"), ("log_gamma", ORANGE, "--"), ("log_P0", GREEN, "-.")):
-        label = {"log_K": "$K$", "log_gamma": "$\\gamma$", "log_P0": "$P_0$"}[key]
-        right.plot(np.exp(history.theta[key] - history.theta[key][0]), color=colour, ls=style, label=label)
-    right.set(xlabel="step", ylabel="factor on the start [1]", yscale="log")
+    left.semilogy(history.cost, color=COLOURS[0])
+    left.set(xlabel="step [1]", ylabel="cost on the seen scenarios [$10^{-3}$ deg$^2$]", title="Tuning by gradient")
+    for i, (key, label) in enumerate({"log_K": "$K$", "log_gamma": "$\\gamma$", "log_P0": "$P_0$"}.items(), 1):
+        right.plot(np.exp(history.theta[key] - history.theta[key][0]), color=COLOURS[i], ls=LINES[i], label=label)
+    right.set(xlabel="step [1]", ylabel="factor on the start [1]", yscale="log")
     right.legend()
     for ax in (left, right):
         ax.grid(alpha=0.3)
@@ -477,11 +489,11 @@ def tuning(report: Report):
 
 def attitude_figure(log, title):
     fig, (top, bottom) = plt.subplots(2, 1, figsize=(7, 6), sharex=True, layout="constrained")
-    top.plot(times, log.theta, color=BLUE, label="attitude")
-    top.plot(times, log.target, color=ORANGE, ls="--", label="desired")
+    top.plot(times, log.theta, color=COLOURS[0], label="attitude")
+    top.plot(times, log.target, color=COLOURS[1], ls="--", label="desired")
     top.set(ylabel="attitude [deg]", title=title)
-    bottom.plot(times, log.rate, color=BLUE, lw=0.8, label="rate")
-    bottom.plot(times, log.target_rate, color=ORANGE, ls="--", label="desired")
+    bottom.plot(times, log.rate, color=COLOURS[0], lw=0.8, label="rate")
+    bottom.plot(times, log.target_rate, color=COLOURS[1], ls="--", label="desired")
     bottom.set(xlabel="time [s]", ylabel="angular rate [deg/s]")
     for ax in (top, bottom):
         ax.legend()
@@ -491,16 +503,16 @@ def attitude_figure(log, title):
 
 def error_figure(log, title):
     fig, (top, bottom) = plt.subplots(2, 1, figsize=(7, 6), sharex=True, layout="constrained")
-    top.plot(times, log.measured, color=BLUE, lw=0.5, label="as measured")
-    top.plot(times, log.error, color=ORANGE, lw=1.2, label="true")
+    top.plot(times, log.measured, color=COLOURS[0], lw=0.5, label="as measured")
+    top.plot(times, log.error, color=COLOURS[1], lw=1.2, ls="--", label="true")
     for side in (-0.25, 0.25):
-        top.axhline(side, color=GREY, lw=0.8, ls=":")
+        top.axhline(side, color=GREY, lw=1, ls=":", label="paper" if side > 0 else None)
     top.set(ylabel="attitude error [deg]", title=title)
-    bottom.plot(times, log.r, color=BLUE, lw=0.5, label="desired $r$")
-    bottom.plot(times, log.y, color=ORANGE, lw=1.2, label="wheel $y$")
+    bottom.plot(times, log.r, color=COLOURS[2], lw=1.4, label="desired $r$")
+    bottom.plot(times, log.y, color=COLOURS[3], lw=0.9, ls="--", label="wheel $y$")
     bottom.set(xlabel="time [s]", ylabel="wheel speed [deg/s]")
     for ax in (top, bottom):
-        ax.legend(loc="lower center" if ax is top else "lower left", ncols=2 if ax is top else 1)
+        ax.legend(loc="lower center" if ax is top else "lower left", ncols=3 if ax is top else 1)
         ax.grid(alpha=0.3)
     return fig
 
@@ -509,13 +521,13 @@ def parameter_figure(log, title, J_z=None):
     fig, axes = plt.subplots(1 if J_z is None else 2, 1, figsize=(7, 3.5 if J_z is None else 6), sharex=True,
                              squeeze=False, layout="constrained")  # fmt: skip
     top = axes[0, 0]
-    top.plot(times, log.a_r, color=BLUE, label="$a_r$")
-    top.plot(times, log.a_y, color=ORANGE, label="$a_y$")
-    top.plot(times, log.a_r + log.a_y, color=GREEN, ls="--", label="$a_r + a_y$")
+    top.plot(times, log.a_r, color=COLOURS[0], label="$a_r$")
+    top.plot(times, log.a_y, color=COLOURS[1], ls=LINES[1], label="$a_y$")
+    top.plot(times, log.a_r + log.a_y, color=COLOURS[2], ls=LINES[2], label="$a_r + a_y$")
     top.set(ylabel="parameters [1]", title=title)
     if J_z is not None:
-        axes[1, 0].plot(times, log.J_hat, color=BLUE, label="estimate")
-        axes[1, 0].axhline(J_z, color=ORANGE, ls="--", label="true")
+        axes[1, 0].plot(times, log.J_hat, color=COLOURS[3], label="estimate")
+        axes[1, 0].axhline(J_z, color=GREY, ls="--", label="true")
         axes[1, 0].set(ylabel="inertia [kg m$^2$]")
     axes[-1, 0].set(xlabel="time [s]")
     for ax in axes.flat:

@@ -1,9 +1,8 @@
 """Attitude algebra: modified Rodrigues parameters (MRP), quaternions and 3-2-1 Euler angles.
 
-An attitude is the rotation of the body frame against a reference frame. Every matrix here takes body
-components to reference components unless its name says otherwise. MRP: q = tan(angle/4) axis, with the
-shadow set -q/|q|^2 for the same attitude. Quaternions: scalar first, Hamilton product, so that the matrix of
-p * q is the product of the matrices. Shapes: components lead, lanes trail.
+An attitude is the rotation of the body frame against a reference frame. Every matrix here takes body components to
+reference components. MRP: q = tan(angle/4) axis, with the shadow -q/|q|^2 for the same attitude. Quaternions: scalar
+first, Hamilton product, so that the matrix of p * q is the product of the matrices.
 
 May import: check, vec.
 """
@@ -12,70 +11,61 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 
-from jaxatt.check import door
 from jaxatt.vec import Mat3, Quat, Vec3, cross, norm, safe_sqrt
 
 # MRP
 
 
-@door
 def mrp_rate(q: Vec3, w: Vec3) -> Vec3:
     """dq/dt = G(q) w [1/s] of MRP q for the body rate w [rad/s]; G = ((1 - q.q) I + 2 S(q) + 2 q q') / 4."""
     return (0.25 - 0.25 * (q @ q)) * w + 0.5 * (cross(q, w) + (q @ w) * q)
 
 
-@door
 def mrp_rate_transposed(q: Vec3, v: Vec3) -> Vec3:
     """G(q)' v, the transpose of the map of `mrp_rate`."""
     return (0.25 - 0.25 * (q @ q)) * v + 0.5 * ((q @ v) * q - cross(q, v))
 
 
-@door
 def mrp_product(p: Vec3, q: Vec3) -> Vec3:
     """MRP of the matrix product A(p) A(q), the representative with |.| <= 1; no singularity.
 
-    numerator / d is one representative, numerator / (d - c) its shadow; d >= c / 2 says that the first is the inner
-    one. c >= 1, so neither divides by zero, whereas the textbook ratio is 0/0 for opposite representatives.
+    n / d is one representative, n / (d - c) its shadow; the first is the inner one where d >= c / 2. Since c >= 1 the
+    chosen denominator is never zero, whereas n / d alone is 0/0 where q is the shadow of -p.
     """
     pp, qq = p @ p, q @ q
-    numerator = (1 - qq) * p + (1 - pp) * q + 2 * cross(p, q)
+    n = (1 - qq) * p + (1 - pp) * q + 2 * cross(p, q)
     c, d = (1 + pp) * (1 + qq), 1 + pp * qq - 2 * (p @ q)
-    return 1 / jnp.where(c <= 2 * d, d, d - c) * numerator
+    return n / jnp.where(d >= c / 2, d, d - c)
 
 
-@door
 def mrp_error(q: Vec3, q_d: Vec3) -> Vec3:
     """MRP of A(q_d)' A(q), the attitude q as seen from the target q_d, |.| <= 1; de/dt = G(e) w for a target at rest."""
     return mrp_product(-q_d, q)
 
 
-@door
 def mrp_inner(q: Vec3) -> Vec3:
     """The representative with |q| <= 1: the shadow -q/|q|^2 where |q| > 1."""
-    return -1 / jnp.where(q @ q > 1, q @ q, -1) * q
+    qq = q @ q
+    return q / jnp.where(qq > 1, -qq, 1)
 
 
-@door
 def mrp_nearest(q: Vec3, p: Vec3) -> Vec3:
     """The representative of q, itself or its shadow, that lies nearest to p."""
     qq = q @ q
-    keep = qq - 1 <= 2 * (q @ p)  # |q - p| <= |-q/|q|^2 - p|, which zero passes: its shadow lies at infinity
-    return 1 / jnp.where(keep, 1, -qq) * q
+    keep = qq - 1 <= 2 * (q @ p)  # |q - p| <= |-q/|q|^2 - p| without a division: the shadow of zero is at infinity
+    return q / jnp.where(keep, 1, -qq)
 
 
-@door
 def mrp_matrix(q: Vec3) -> Mat3:
     """Rotation matrix of MRP q, body to reference."""
     return quat_matrix(quat_from_mrp(q))
 
 
-@door
 def mrp_from_quat(p: Quat) -> Vec3:
     """MRP, |q| <= 1, of a unit quaternion."""
     return jnp.where(p.w < 0, -1, 1) / (1 + jnp.abs(p.w)) * p.v
 
 
-@door
 def quat_from_mrp(q: Vec3) -> Quat:
     """Unit quaternion of MRP q."""
     qq = q @ q
@@ -85,38 +75,37 @@ def quat_from_mrp(q: Vec3) -> Quat:
 # quaternions
 
 
-@door
 def quat_conjugate(p: Quat) -> Quat:
     """The inverse of a unit quaternion."""
     return Quat(p.w, -p.x, -p.y, -p.z)
 
 
-@door
 def quat_normalised(p: Quat) -> Quat:
     """p / |p|."""
-    return p * (1 / jnp.sqrt(p @ p))
+    return p / jnp.sqrt(p @ p)
 
 
-@door
 def quat_error(p: Quat, p_d: Quat) -> Quat:
     """Attitude p as seen from the target p_d."""
     return quat_conjugate(p_d) * p
 
 
-@door
 def quat_rate(p: Quat, w: Vec3) -> Quat:
     """dp/dt = p (0, w) / 2 [1/s] for the body rate w [rad/s]."""
-    return 0.5 * (p * Quat(jnp.zeros_like(w.x), *w))
+    return 0.5 * (p * Quat(0.0, *w))
 
 
-@door
 def quat_rotate(p: Quat, v: Vec3) -> Vec3:
     """v from body to reference components: p v conj(p)."""
     t = 2 * cross(p.v, v)
     return v + p.w * t + cross(p.v, t)
 
 
-@door
+def quat_to_body(p: Quat, v: Vec3) -> Vec3:
+    """v from reference to body components, A(p) v: conj(p) v p."""
+    return quat_rotate(quat_conjugate(p), v)
+
+
 def quat_matrix(p: Quat) -> Mat3:
     """Rotation matrix of a unit quaternion, body to reference."""
     w, x, y, z = p
@@ -127,7 +116,6 @@ def quat_matrix(p: Quat) -> Mat3:
     )
 
 
-@door
 def quat_from_vector(r: Vec3) -> Quat:
     """Unit quaternion of the rotation vector r [rad]; smooth at zero."""
     half = 0.5 * norm(r)
@@ -136,7 +124,6 @@ def quat_from_vector(r: Vec3) -> Quat:
     return Quat(jnp.cos(half), *(0.5 * sinc * r))
 
 
-@door
 def quat_angle(p: Quat):
     """Rotation angle of a unit quaternion [rad], in [0, pi]."""
     return 2 * jnp.arctan2(norm(p.v), jnp.abs(p.w))
@@ -145,7 +132,6 @@ def quat_angle(p: Quat):
 # Euler angles 3-2-1: about z, then the new y, then the new x. As Vec3 (about x, about y, about z) [rad].
 
 
-@door
 def euler_rate(a: Vec3, w: Vec3) -> Vec3:
     """d(angles)/dt [rad/s] for the body rate w [rad/s]; singular where the angle about y is +-90 deg."""
     s, c = jnp.sin(a.x), jnp.cos(a.x)
@@ -153,7 +139,6 @@ def euler_rate(a: Vec3, w: Vec3) -> Vec3:
     return Vec3(w.x + jnp.tan(a.y) * q, w.y * c - w.z * s, q / jnp.cos(a.y))
 
 
-@door
 def euler_body_rate(a: Vec3, rate: Vec3) -> Vec3:
     """Body rate [rad/s] of the angle rates: the inverse of `euler_rate`, regular everywhere."""
     s, c = jnp.sin(a.x), jnp.cos(a.x)
@@ -161,18 +146,15 @@ def euler_body_rate(a: Vec3, rate: Vec3) -> Vec3:
     return Vec3(rate.x - rate.z * jnp.sin(a.y), rate.y * c + q * s, q * c - rate.y * s)
 
 
-@door
 def quat_from_euler(a: Vec3) -> Quat:
     """Unit quaternion of 3-2-1 Euler angles [rad]."""
-    o = jnp.zeros_like(a.x)
     half = 0.5 * a
-    about_x = Quat(jnp.cos(half.x), jnp.sin(half.x), o, o)
-    about_y = Quat(jnp.cos(half.y), o, jnp.sin(half.y), o)
-    about_z = Quat(jnp.cos(half.z), o, o, jnp.sin(half.z))
+    about_x = Quat(jnp.cos(half.x), jnp.sin(half.x), 0.0, 0.0)
+    about_y = Quat(jnp.cos(half.y), 0.0, jnp.sin(half.y), 0.0)
+    about_z = Quat(jnp.cos(half.z), 0.0, 0.0, jnp.sin(half.z))
     return about_z * about_y * about_x
 
 
-@door
 def euler_from_quat(p: Quat) -> Vec3:
     """3-2-1 Euler angles [rad] of a unit quaternion, the angle about y in [-90, 90] deg."""
     m = quat_matrix(p)

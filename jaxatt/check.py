@@ -1,22 +1,21 @@
-"""The door: what a user hands in is converted and checked here, before anything is compiled.
+"""Checks of what a user hands in, before anything is compiled.
 
 One grammar for every refusal: "`name` must be such, but it is value." Checks read concrete numbers; under a
-transformation (jit, grad, vmap) there are none and they pass. Lanes trail: the message names the first
-offending lane. name: what the message calls the argument; value: what was handed in; must and reason: words of the
-message.
+transformation (jit, grad, vmap) there are none and they pass. Of many numbers the message names the first one that is
+refused. name: what the message calls the argument; value: what was handed in; must and reason: words of the message.
 
 May import: nothing of ours.
 """
 
 from __future__ import annotations
 
+import sys
 import warnings
-from collections.abc import Callable, Mapping
-from functools import wraps
-from inspect import signature
+from collections.abc import Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
-from traceback import walk_tb
-from typing import Any, NoReturn, TypeVar
+from typing import Any, NoReturn
 
 import jax
 import jax.numpy as jnp
@@ -24,10 +23,9 @@ import numpy as np
 from jax.core import Tracer
 
 
-def refuse(name: str, must: str, value, lane: int | None = None) -> NoReturn:
-    """Raise the ValueError "`name` must ..., but it is value (in scenario lane)"."""
-    where = "" if lane is None else f" in scenario {lane}"
-    raise ValueError(f"`{name}` must {must}, but it is {value}{where}.")
+def refuse(name: str, must: str, value) -> NoReturn:
+    """Raise the ValueError "`name` must ..., but it is value."."""
+    raise ValueError(f"`{name}` must {must}, but it is {value}.")
 
 
 def short(value) -> str:
@@ -43,12 +41,40 @@ def concrete(tree) -> bool:
     return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
+_batch: ContextVar[int | None] = ContextVar("number of scenarios that are checked at once", default=None)
+
+
+@contextmanager
+def scenarios(n: int | None):
+    """Within it, the last axis of length n of what is checked holds the scenarios; None: there is just one."""
+    token = _batch.set(n)
+    try:
+        yield
+    finally:
+        _batch.reset(token)
+
+
 def each(name: str, must: str, value, good) -> None:
     """Refuse the first of the concrete numbers ``value`` for which ``good`` is False."""
     value, good = np.broadcast_arrays(np.asarray(value), np.asarray(good))
     if not good.all():
         bad = tuple(int(i) for i in np.argwhere(~good)[0])
-        refuse(name, must, f"{float(value[bad]):g}", bad[-1] if bad else None)
+        at, where = _place_of(bad, value.shape)
+        raise ValueError(f"`{name}{at}` must {must}, but it is {float(value[bad]):g}{where}.")
+
+
+def pair(name: str, must: str, value, other, holds) -> None:
+    """Refuse the first number of ``value`` of which holds(value, other) is False; tracers pass."""
+    if concrete((value, other)):
+        each(name, must, value, holds(np.asarray(value), np.asarray(other)))
+
+
+def _place_of(index: tuple, shape: tuple) -> tuple[str, str]:
+    """Where in an array an index lies: the words behind the name, and those that tell the scenario."""
+    n, where = _batch.get(), ""
+    if n is not None and shape[-1:] == (n,):
+        index, where = index[:-1], f" in scenario {index[-1]}"
+    return (f"[{', '.join(map(str, index))}]" if index else ""), where
 
 
 def real(name: str, value) -> np.ndarray:
@@ -96,7 +122,13 @@ def between(name: str, value, low: float, high, reason: str) -> None:
     if concrete((value, high)):
         value, high = real(name, value), np.asarray(high)
         inside = (value > low) & (value < high)
-        each(name, f"lie in ({low:g}, {np.min(high):g}), {reason},", value, inside)
+        met = np.broadcast_to(high, inside.shape)[~inside][:1]  # by the first that is refused
+        each(name, f"lie in ({low:g}, {met.sum():g}), {reason}", value, inside)
+
+
+def acute(name: str, value) -> None:
+    """Refuse angles [rad] outside 0 to 90 deg."""
+    between(name, value, 0, np.pi / 2, "0 to 90 deg in rad")
 
 
 def one_of(name: str, value, allowed: tuple) -> None:
@@ -123,27 +155,69 @@ def a_number(name: str, tree) -> None:
 
 
 def moments(name: str, matrix) -> np.ndarray | None:
-    """Principal moments, ascending, shape (3, *lanes), of an inertia given as three rows [kg m^2].
+    """Principal moments, ascending, shape (3,) of an inertia given as three rows, first axis; None for tracers.
 
-    Refuses a matrix that is not symmetric or not positive definite. None under a transformation.
+    Refuses a matrix that is not symmetric or not positive definite, and moments that no body has: each is at most the
+    sum of the other two (a plate reaches it).
     """
     if not concrete(matrix):
         return None
-    rows = [np.broadcast_arrays(*(np.asarray(a, float) for row in matrix for a in row))]
-    m = np.moveaxis(np.stack(rows[0]).reshape(3, 3, *rows[0][0].shape), (0, 1), (-2, -1))
     finite(name, matrix)
-    skew = np.abs(m - np.swapaxes(m, -1, -2)).max((-1, -2))
+    entries = np.stack(np.broadcast_arrays(*(np.asarray(a, float) for row in matrix for a in row)))
+    m = np.moveaxis(entries.reshape(3, 3, *entries.shape[1:]), (0, 1), (-2, -1))
     size = np.abs(m).max((-1, -2))
-    each(f"{name} - {name}'", "be zero (a symmetric matrix)", skew, skew <= 1e-6 * size)
-    principal = np.linalg.eigvalsh(m)
-    least = principal[..., 0]
-    if not (least > 0).all():
-        bad = tuple(int(i) for i in np.argwhere(~(least > 0))[0])
-        where = f" in scenario {bad[-1]}" if bad else ""
-        raise ValueError(
-            f"`{name}` must be positive definite, but its smallest principal moment is {least[bad]:g} kg m^2{where}."
-        )
-    return np.moveaxis(principal, -1, 0)
+    skew = np.abs(m - np.swapaxes(m, -1, -2)).max((-1, -2))
+    each(name, "be symmetric (largest difference to its transpose 0)", skew, skew <= 1e-6 * size)
+    principal = np.moveaxis(np.linalg.eigvalsh(m), -1, 0)
+    each(name, "be positive definite (smallest principal moment > 0)", principal[0], principal[0] > 0)
+    excess = principal[2] - principal[0] - principal[1]
+    must = "have no principal moment above the sum of the other two (no body is thinner than a plate; excess 0)"
+    each(name, must, excess, excess <= 1e-5 * size)
+    return principal
+
+
+def inertia(name: str, matrix) -> None:
+    """Refuse a matrix that is the inertia of no body: see `moments`."""
+    moments(name, matrix)
+
+
+def limit(name: str, value) -> None:
+    """Refuse a limit that is not > 0; inf stands for no limit."""
+    above(name, value, 0, "inf for no limit")
+
+
+def flag(name: str, value) -> None:
+    """Refuse numbers other than 0 and 1."""
+    one_of(name, value, (0, 1))
+
+
+def share(name: str, value) -> None:
+    """Refuse numbers outside [0, 1]."""
+    if concrete(value):
+        value = real(name, value)
+        each(name, "lie in [0, 1]", value, (value >= 0) & (value <= 1))
+
+
+def unit(name: str, v, tolerance: float = 1e-5) -> None:
+    """Refuse a vector or quaternion v, given by components, whose length is not 1 within the tolerance."""
+    if concrete(v):
+        length = _length(name, v)
+        each(f"|{name}|", "be 1", length, np.abs(length - 1) <= tolerance)
+
+
+def mrp(name: str, q) -> None:
+    """Refuse modified Rodrigues parameters that are not finite or longer than 10, which are degrees by mistake.
+
+    |q| = tan(angle / 4) <= 1 describes every attitude; beyond it lies the shadow set.
+    """
+    if concrete(q):
+        length = _length(name, q)
+        each(f"|{name}|", "be at most 10 (an MRP is tan(angle/4), 1 for half a turn)", length, length <= 10)
+
+
+def _length(name: str, v) -> np.ndarray:
+    finite(name, v)
+    return np.sqrt(sum(np.square(np.asarray(a, float)) for a in v))
 
 
 def whole(name: str, value, least: int = 1) -> int:
@@ -204,7 +278,7 @@ def free_memory() -> float:
 
 def float_type(trees):
     """The floating type of a run: what the floating leaves promote to; Python numbers follow the others."""
-    kinds = {leaf.dtype for leaf in jax.tree.leaves(trees) if hasattr(leaf, "dtype")}
+    kinds = {jax.dtypes.canonicalize_dtype(leaf.dtype) for leaf in jax.tree.leaves(trees) if hasattr(leaf, "dtype")}
     return jnp.result_type(1.0, *(kind for kind in kinds if jnp.issubdtype(kind, jnp.floating)))
 
 
@@ -214,8 +288,15 @@ def precise(said: str, trees) -> None:
     trees: the params and the scenario of the run.
     """
     if float_type(trees) == np.float32:
-        way_out = "Run in float64: jax.config.update('jax_enable_x64', True)."
-        warnings.warn(f"{said}. {way_out}", stacklevel=5)  # of simulate and sweep
+        warn(f"{said}. Run in float64: jax.config.update('jax_enable_x64', True).")
+
+
+def warn(message: str) -> None:
+    """Warn of what is allowed and likely wrong, at the line that called jaxatt from outside."""
+    here, frame, level = str(Path(__file__).parent), sys._getframe(), 1
+    while frame.f_back is not None and frame.f_code.co_filename.startswith(here):
+        frame, level = frame.f_back, level + 1
+    warnings.warn(message, stacklevel=level)
 
 
 def converted(params, scenario) -> tuple[Any, Any]:
@@ -262,155 +343,27 @@ def kind(name: str, value, wanted: type) -> None:
         raise TypeError(f"`{name}` must be a {wanted.__name__}, but it is {short(value)}.")
 
 
-def shapes(params, scenario, params_like, scenario_like) -> tuple:
-    """The lanes of a scenario: `lanes_of` both, where params carry none or, in a design study, the scenario's.
-
-    params_like, scenario_like: examples of both.
-    """
-    lanes, its = lanes_of("scenario", scenario, scenario_like), lanes_of("params", params, params_like)
-    if its not in ((), lanes):
-        refuse("params", f"carry no lanes, or the scenario's, {lanes}", its)
-    return lanes
+def kinds(params, Params: type, scenario, Scenario: type) -> None:
+    """Refuse, with TypeError, params and scenarios of another loop."""
+    kind("params", params, Params)
+    kind("scenario", scenario, Scenario)
 
 
-def lanes_of(name: str, tree, example) -> tuple:
-    """The lanes that the leaves of a tree carry behind the shapes of the example's: the same for all of them.
-
-    Refuses another structure and integers in place of floats, with TypeError, and other shapes, with ValueError, by
-    the name of the leaf. A part for which the example has None is passed over.
-    """
-    found = _lanes_found(name, tree, example)
-    (first, lanes), *others = found
-    for other, its in others:
-        if its != lanes:
-            refuse(other, f"carry the same lanes as `{first}`, {lanes}", its)
-    return lanes
-
-
-def _lanes_found(name: str, tree, example) -> list[tuple[str, tuple]]:
-    if example is None:
-        return []
-    if hasattr(example, "_fields"):
-        kind(name, tree, type(example))
-        return [
-            found
-            for field, part, its_example in zip(example._fields, tree, example)
-            for found in _lanes_found(f"{name}.{field}", part, its_example)
-        ]
-    if not is_number(tree):
-        raise TypeError(f"`{name}` must be a number or an array, but it is {short(tree)}.")
-    if hasattr(tree, "dtype") and not jnp.issubdtype(tree.dtype, jnp.floating):
-        raise TypeError(f"`{name}` must be floating-point, but it is {short(tree)}.")
-    shape, components = np.shape(tree), np.shape(example)
-    if shape[: len(components)] != components:
-        refuse(name, f"have shape ({''.join(f'{n}, ' for n in components)}*lanes)", shape)
-    return [(name, shape[len(components) :])]
-
-
-def lanes(scenarios) -> int:
-    """Number of scenarios of a sweep: the last axis, which every leaf must carry."""
+def batch_size(name: str, scenarios) -> int:
+    """Number n of scenarios of a sweep, with which every leaf must lead; ValueError, by the leaf's path, if not."""
     leaves = jax.tree_util.tree_leaves_with_path(scenarios)
     if not leaves:
-        raise ValueError("`scenarios` must hold at least one array, but it is empty.")
+        raise ValueError(f"`{name}` must hold at least one array, but it is empty.")
     shapes = {jax.tree_util.keystr(path): np.shape(leaf) for path, leaf in leaves}
     for path, shape in shapes.items():
         if not shape:
-            raise ValueError(f"`scenarios{path}` must carry the scenarios in its last axis, but it is a single number.")
-    n = max(shape[-1] for shape in shapes.values())
+            refuse(
+                name + path, "lead with the scenarios, shape (n, ...)", "a single number: see `jax.vmap(draw)(keys)`"
+            )
+    n = max(shape[0] for shape in shapes.values())
     for path, shape in shapes.items():
-        if shape[-1] != n:
-            raise ValueError(f"`scenarios{path}` must hold {n} scenarios in its last axis, but its shape is {shape}.")
+        if shape[0] != n:
+            refuse(name + path, f"lead with the same {n} scenarios as the other leaves", f"of shape {shape}")
     if n == 0:
-        raise ValueError("`scenarios` must hold at least one scenario, but its last axis is empty.")
+        refuse(name, "hold at least one scenario", "empty")
     return n
-
-
-# the door of a function of numbers
-
-
-F = TypeVar("F", bound=Callable)
-
-
-def door(f: F) -> F:
-    """f, but what it cannot work with is refused in one line that names the argument.
-
-    Nothing is checked where f works, so that it costs nothing. What goes wrong in a function that a caller hands in
-    is seen whole. An argument annotated with a NamedTuple must be one.
-    """
-    wanted = {
-        name: ("" if p.annotation is p.empty else str(p.annotation)) + (" | None" if p.default is None else "")
-        for name, p in signature(f).parameters.items()
-    }
-
-    @wraps(f)
-    def at_the_door(*args, **kwargs):
-        try:
-            return f(*args, **kwargs)
-        except (TypeError, ValueError, AttributeError, LookupError, ArithmeticError, NotImplementedError) as error:
-            if isinstance(error, (jax.errors.JAXTypeError, jax.errors.JAXIndexError)):
-                raise  # a tracer where a number is needed: no fault of the input
-            if _from_outside(error, (*args, *kwargs.values())):
-                raise
-            said = " ".join(str(error).split())
-            try:
-                given = signature(f).bind(*args, **kwargs).arguments
-            except TypeError as wrong:
-                raise TypeError(f"`{f.__name__}` must be called as {f.__name__}{signature(f)}: {wrong}.") from None
-            ours = isinstance(error, (TypeError, ValueError)) and said.startswith("`")
-            if ours and {_subject(said), _subject(said) + "s"} & set(given):  # one of the labels is a label
-                raise type(error)(said) from None
-            _blame(f.__name__, given, wanted, said)
-
-    return at_the_door  # pyright: ignore[reportReturnType]
-
-
-def _from_outside(error: Exception, given) -> bool:
-    """Whether the error arose in one of the functions given."""
-    codes = {getattr(getattr(f, "func", f), "__code__", None) for f in given} - {None}
-    return any(frame.f_code in codes for frame, _ in walk_tb(error.__traceback__))
-
-
-def _subject(said: str) -> str:
-    """The argument that a refusal names: what its first word begins with."""
-    word = said[1:].split("`")[0]
-    return "".join(c if c.isidentifier() or c.isdigit() else " " for c in word).split(" ")[0]
-
-
-def _blame(called: str, given: dict, wanted: dict, said: str) -> NoReturn:
-    for name, value in given.items():
-        note = wanted[name]
-        if value is None and "None" in note:
-            continue
-        kind = note.split("[")[0].split(" ")[0]
-        a_tuple = kind.isidentifier() and kind[0].isupper() and kind not in ("Any", "Axes", "Sequence")
-        its_type = (lambda a, k=kind: type(a).__name__ == k, f"a {kind}") if a_tuple else (lambda _: True, "")
-        fits, what = KINDS.get(kind, its_type)
-        if not fits(value):
-            raise TypeError(f"`{name}` must be {what}, but it is {short(value)}.") from None
-        if kind in ("Callable", "Axes") or "str" in note:
-            continue
-        for leaf in _leaves(value):
-            a_key = name == "key" and jnp.issubdtype(getattr(leaf, "dtype", bool), jax.dtypes.prng_key)
-            if not (is_number(leaf) or a_key or hasattr(leaf, "keys") or hasattr(leaf, "plot")):  # a table, axes
-                raise TypeError(f"`{name}` must hold real numbers, but it holds {short(leaf)}.") from None
-    shapes = ", ".join(f"`{name}` has {_shapes(value)}" for name, value in given.items())
-    raise ValueError(f"`{called}` must get arguments that fit, but {shapes}: {said[:120]}") from None
-
-
-KINDS = {
-    "Callable": (callable, "a function"),
-    "Mapping": (lambda a: isinstance(a, Mapping), "a mapping"),
-    "str": (lambda a: isinstance(a, str), "a string"),
-}  # what an annotation asks for, beside NamedTuples and numbers
-
-
-def _shapes(value) -> str:
-    shapes = sorted({str(np.shape(leaf)) for leaf in _leaves(value) if is_number(leaf)})
-    return f"shape {' and '.join(shapes[:3])}" if shapes else short(value)
-
-
-def _leaves(value) -> list:
-    try:
-        return jax.tree.leaves(value, is_leaf=lambda a: a is None)
-    except ValueError:  # a dict whose keys have no order
-        return [value]

@@ -1,56 +1,84 @@
 """Faults as data: what goes wrong with one channel, from when to when.
 
-A `Fault` is numbers in the scenario, so every kind, size and onset is a batch axis and nothing recompiles.
-A faulty channel stays affine in the truth, reading = gain * truth + offset (`Channel`), which serves sampled
-sensors and those read continuously between ticks alike.
+A `Fault` is numbers in the scenario, so every kind, size and onset can differ from scenario to scenario and nothing
+recompiles. A faulty channel stays affine in the truth, reading = gain * truth + offset (`Channel`), which serves sensors
+that are sampled and those that are read continuously between ticks.
 
 May import: check, vec.
 """
 
 from __future__ import annotations
 
-from functools import reduce
-from typing import Any, NamedTuple
+from functools import reduce, wraps
+from typing import Annotated, Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxatt import check
-from jaxatt.check import door
+from jaxatt.check import a_number, flag, not_negative, positive
 from jaxatt.vec import Vec3, safe_sqrt
 
 
 class Fault(NamedTuple):
-    """One channel's fault; what is not set does nothing. Kinds combine. Every field has shape (*lanes)."""
+    """One channel's fault; what is not set does nothing, and kinds combine.
 
-    onset: Any = jnp.inf  # [s] first instant of the fault
-    end: Any = jnp.inf  # [s] first instant after it
-    bias: Any = 0.0  # [channel unit] constant offset
-    drift: Any = 0.0  # [channel unit] incipient offset: drift (1 - exp(-(t - onset) / tau))
-    tau: Any = 1.0  # [s] time constant of the drift
-    random: Any = 0.0  # [channel unit] standard deviation of a Gaussian signal, held from tick to tick
-    scale: Any = 1.0  # [1] factor on the true signal: scale-factor error, loss of effectiveness
-    growth: Any = 1.0  # [1] factor on the channel's own noise
-    stuck: Any = 0.0  # [1] 1: the reading stays at the last one before the onset
+    ``Fault()`` is a healthy channel. A fault whose kind is given but not its onset is there from the start:
+    ``Fault(bias=0.1)`` is ``Fault(onset=0.0, bias=0.1)``. Fields of shape () for one channel, or (n,) for n.
+    """
+
+    onset: Annotated[Any, "s", a_number] = jnp.inf  # first instant of the fault
+    end: Annotated[Any, "s", a_number] = jnp.inf  # first instant after it
+    bias: Annotated[Any, a_number] = 0.0  # [unit of the channel] constant offset
+    drift: Annotated[Any, a_number] = 0.0  # [unit of the channel] incipient offset: drift (1 - exp(-(t - onset) / tau))
+    tau: Annotated[Any, "s", positive] = 1.0  # time constant of the drift
+    random: Annotated[Any, not_negative] = 0.0  # [unit of the channel] std of a Gaussian signal, held between ticks
+    scale: Annotated[Any, "1", a_number] = 1.0  # factor on the true signal: scale-factor error, loss of effectiveness
+    growth: Annotated[Any, "1", not_negative] = 1.0  # factor on the channel's own noise
+    stuck: Annotated[Any, "1", flag] = 0.0  # 1: the reading stays at the last one before the onset
+
+    def check(self, name: str) -> None:
+        """Refuse, with ValueError, a fault that ends before its onset."""
+        check.pair(f"{name}.end", "not lie before the onset", self.end, self.onset, np.greater_equal)
+
+
+_tuple_made = Fault.__new__
+
+
+@wraps(_tuple_made)
+def _made(cls, *fields, **kinds):
+    if not fields and "onset" not in kinds:
+        kinds["onset"] = 0.0 if kinds else jnp.inf
+    return _tuple_made(cls, *fields, **kinds)
+
+
+Fault.__new__ = _made  # a NamedTuple takes no __new__ of its own in its body
 
 
 class Channel(NamedTuple):
-    """How a channel reads until the next tick: gain * truth + offset. Fields of shape (*lanes)."""
+    """How a channel reads until the next tick: gain * truth + offset."""
 
     gain: Any  # [1]
-    offset: Any  # [channel unit]
+    offset: Any  # [unit of the channel]
 
 
 class Reading(NamedTuple):
-    """A measurement that may be missing: a dead gyro and an unsampled or masked channel are the same thing."""
+    """A measurement that may be missing: a dead gyro and a channel that was not sampled are the same thing."""
 
-    value: Any  # [channel unit]
-    valid: Any  # [bool] what is not valid is not used, whatever its value
+    value: Any  # [unit of the channel]
+    valid: Any  # bool: what is not valid is not used, whatever its value
 
 
-def dead(onset=0.0, end=jnp.inf) -> Fault:
+def dead(onset: Any = 0.0, end: Any = jnp.inf) -> Fault:
     """A channel that reads exactly zero from onset to end [s]."""
     return Fault(onset, end, scale=0.0, growth=0.0)
+
+
+def dead_where(mask, onset: Any = 0.0) -> Fault:
+    """Those of several units, gyros or wheels, that are dead from onset [s] on: where mask, (n,) of bool, is true."""
+    mask = jnp.asarray(mask, bool)
+    return jax.tree.map(lambda a: jnp.broadcast_to(a, mask.shape), dead(jnp.where(mask, onset, jnp.inf)))
 
 
 def on_axes(fault: Fault) -> Vec3:
@@ -58,31 +86,38 @@ def on_axes(fault: Fault) -> Vec3:
     return Vec3(fault, fault, fault)
 
 
-@door
+def healthy() -> Channel:
+    """A channel that reads the truth."""
+    return Channel(1.0, 0.0)
+
+
+def faults_of(tree) -> list[Fault]:
+    """Every `Fault` in a tree, such as a scenario, a `Vec3` of faults or one fault."""
+    leaves = jax.tree.leaves(tree, is_leaf=lambda node: isinstance(node, Fault))
+    return [leaf for leaf in leaves if isinstance(leaf, Fault)]
+
+
 def active(fault: Fault, t):
     """Whether the fault is on at t [s]: onset <= t < end."""
     return (t >= fault.onset) & (t < fault.end)
 
 
-@door
 def any_active(faults, t):
-    """Whether any of the faults, a sequence of `Fault`, is on at t [s]."""
-    return reduce(jnp.logical_or, [active(f, t) for f in faults])
+    """Whether any of the faults, any tree that holds some, is on at t [s]."""
+    return reduce(jnp.logical_or, [active(f, t) for f in faults_of(faults)])
 
 
-@door
 def first_onset(faults):
-    """The earliest onset [s] of faults, a sequence of `Fault`; inf where there is none."""
-    return reduce(jnp.minimum, [f.onset for f in faults])
+    """The earliest onset [s] of the faults, any tree that holds some; inf where there is none."""
+    return reduce(jnp.minimum, [f.onset for f in faults_of(faults)])
 
 
-@door
 def channel(fault: Fault, t, std, normal, last) -> Channel:
     """The channel as it reads from tick time t [s] on.
 
-    std: standard deviation of its noise [channel unit]; normal: a standard normal number, which serves the noise
-    and ``fault.random`` together, for the sum of two Gaussian signals is one; last: the previous reading, which
-    a stuck channel repeats. All of shape (*lanes).
+    std: standard deviation of its noise [unit of the channel]; normal: a standard normal number, which serves the noise
+    and ``fault.random`` together, for the sum of two Gaussian signals is one; last: the previous reading, which a stuck
+    channel repeats.
     """
     on = active(fault, t)
     stuck = on & (fault.stuck > 0)
@@ -96,25 +131,6 @@ def channel(fault: Fault, t, std, normal, last) -> Channel:
     )
 
 
-@door
 def read(c: Channel, truth):
-    """The reading of a channel whose true signal is truth [channel unit]."""
+    """The reading of a channel whose true signal is truth [unit of the channel]."""
     return c.gain * truth + c.offset
-
-
-def check_fault(name: str, fault: Fault) -> None:
-    """Refuse, with ValueError, a fault with NaN, a negative size of noise, tau <= 0 or end < onset.
-
-    TypeError for what is no `Fault` of numbers.
-    """
-    check.kind(name, fault, Fault)
-    for field, value in zip(Fault._fields, fault):
-        if check.concrete(value):
-            check.real(f"{name}.{field}", value)
-    check.a_number(name, check.numbers(name, fault))
-    check.positive(f"{name}.tau", fault.tau)
-    for field in ("random", "growth"):
-        check.not_negative(f"{name}.{field}", getattr(fault, field))
-    check.one_of(f"{name}.stuck", fault.stuck, (0, 1))
-    if check.concrete((fault.onset, fault.end)):
-        check.each(f"{name}.end", "not lie before the onset", fault.end, np.asarray(fault.end) >= fault.onset)

@@ -1,16 +1,16 @@
 """Recorded readings through on-board code: the functions that a closed loop runs, without the loop.
 
-`replay` hands readings, one set a tick, to a loop's ``decide`` and lets its on-board flow run between the ticks. A
-closed loop gives the functions and where the board starts::
+`replay` hands readings, one set a tick, to a loop's ``decide`` and lets its on-board flow run between the ticks. A closed
+loop gives the functions and what the computer knows at the start::
 
-    board = loop.init(loop.params, loop.scenario)[1].board
-    boards, logs = replay(loop.decide, loop.params, board, readings, dt=loop.DT)
+    computer = loop.computer_of(*loop.init(loop.params, loop.scenario))
+    computers, logs = replay(loop.decide, loop.params, computer, readings, dt=loop.DT)
 
-Of a board the scenario decides the start alone: initial estimates and the like. Where an observer or an adaptive law
-moves between ticks (`observer_pd`, `wheel_mrac`), ``flow=loop.board_flow`` and the system's ``substeps`` go along.
+Of the computer the scenario decides the start alone: initial estimates and the like. Where an observer or an adaptive law
+moves between ticks (`observer_pd`, `wheel_mrac`), ``flow=loop.computer_flow`` and the system's ``substeps`` go along.
 `load` reads a CSV or Parquet file, which never executes code, and `resample` brings its samples to the ticks.
 
-May import: check, vec, faults, engine.
+May import: check, faults, contract, compiling, engine.
 """
 
 from __future__ import annotations
@@ -27,8 +27,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxatt import check
-from jaxatt.check import door
-from jaxatt.engine import Now, compiled, like, rk4
+from jaxatt.compiling import compiled
+from jaxatt.contract import Now
+from jaxatt.engine import alone, match_state, rk4
 from jaxatt.faults import Reading
 
 EXAMPLE = Path(__file__).parent / "data" / "telemetry.csv"  # made by notebooks/telemetry.py, with a hidden fault
@@ -38,7 +39,7 @@ SPARSE = 1000  # ticks per sample beyond which the times are taken to be wrong
 def replay(
     decide: Callable,
     params,
-    board,
+    computer,
     readings,
     *,
     dt: float,
@@ -46,20 +47,31 @@ def replay(
     substeps: int = 1,
     between: Any = None,
 ):
-    """Run on-board code on recorded readings; returns boards and logs, time first.
+    """Run on-board code on recorded readings.
 
-    decide: (params, now, board, readings) -> board, log, as in a closed loop. board: what the computer knows before
-    the first tick. readings: what ``decide`` takes, every leaf with the T ticks in its first axis and lanes, if
-    any, in its last, where the board has them too. dt: [s] between ticks; the first tick has t = 0.
+    Pure: jit, grad and ``jax.vmap`` it over several recordings.
 
-    flow: (params, board, readings) -> rates, a dict by name of those fields of the board that move between ticks,
-    integrated by ``substeps`` RK4 steps a tick. It sees the readings of the tick, held, unless ``between`` has
-    finer ones: leaves of shape (T, substeps, 4, ...), at the stages of each step (its start, its middle twice, its end).
+    Args:
+        decide: (params, now, computer, readings) -> computer, log, as in a closed loop.
+        params: what the engineer ships.
+        computer: what the computer knows before the first tick.
+        readings: what ``decide`` takes, every leaf with the T ticks in its first axis.
+        dt: [s] between ticks; the first tick has t = 0.
+        flow: (params, computer, readings) -> rates, a dict by name of those fields of the computer that move between
+            ticks. It sees the readings of the tick, held, unless ``between`` has finer ones.
+        substeps: RK4 steps of ``flow`` between ticks.
+        between: readings at the stages of each step (its start, its middle twice, its end), every leaf of shape
+            (T, substeps, 4, ...).
 
-    boards: what the computer knew after each ``decide``; logs: what it returned. Pure: jit, grad and vmap it.
+    Returns:
+        What the computer knew after each ``decide``, and the logs that it returned, time first.
 
-    Raises ValueError for readings that disagree about T, dt <= 0 or substeps < 1; TypeError for what is no number,
-    and where ``decide`` returns a board of another structure, type or shape.
+    Raises:
+        ValueError: readings that disagree about T, dt <= 0 or substeps < 1.
+        TypeError: what is no number; ``decide`` or ``flow`` that return another structure, type or shape.
+
+    Example:
+        >>> computers, logs = replay(loop.decide, loop.params, computer, readings, dt=loop.DT)
     """
     check.function("decide", decide)
     if flow is not None:
@@ -67,14 +79,14 @@ def replay(
     check.positive("dt", check.number("dt", dt))
     substeps = check.whole("substeps", substeps)
     ticks = _length("readings", readings)
-    for name, tree in (("board", board), ("readings", readings), ("between", between)):
+    for name, tree in (("computer", computer), ("readings", readings), ("between", between)):
         check.numbers(name, tree)
-    params, (board, readings, between) = check.converted(params, (board, readings, between))
+    params, (computer, readings, between) = check.converted(params, (computer, readings, between))
     for path, leaf in jax.tree_util.tree_leaves_with_path(between):
         if leaf.shape[:3] != (ticks, substeps, 4):
             name = f"between{jax.tree_util.keystr(path)}"
             check.refuse(name, f"have shape ({ticks}, {substeps}, 4, ...)", leaf.shape)
-    operands = params, board, readings, between
+    operands = params, computer, readings, between
     return compiled(_replay, 4, operands)(decide, flow, float(dt), substeps, *operands)
 
 
@@ -91,40 +103,43 @@ def _length(name: str, tree) -> int:
     return first[0]
 
 
-def _replay(decide, flow, dt, substeps, params, board, readings, between):
-    dtype = check.float_type((params, board, readings))
+def _replay(decide, flow, dt, substeps, params, computer, readings, between):
+    dtype = check.float_type((params, computer, readings))
     h = dt / substeps
 
-    def flown(t, board, y, stages):
+    def flown(t, computer, y, stages):
         def one(x, step):
             at, seen = step
-            stage = iter(range(4))  # rk4 asks for them in this order
 
-            def rate(t, x):
-                i = next(stage)
-                now = y if seen is None else jax.tree.map(lambda a: a[i], seen)
-                return like(flow(params, board._replace(**x), now), x, "flow")
+            def rate(t, x, now=y):
+                return match_state(flow(params, computer._replace(**x), now), x, "flow")
 
-            return rk4(rate, at, x, h), None
+            return rk4(rate, at, x, h, seen), None
 
-        rates = jax.eval_shape(flow, params, board, y)
-        if not isinstance(rates, dict) or not set(rates) <= set(getattr(board, "_fields", ())):
-            raise TypeError(f"`flow` must return a dict by fields of the board, but it is {check.short(rates)}.")
-        moving = {name: getattr(board, name) for name in rates}
+        rates = jax.eval_shape(flow, params, computer, y)
+        if not isinstance(rates, dict) or not set(rates) <= set(getattr(computer, "_fields", ())):
+            raise TypeError(f"`flow` must return a dict by fields of the computer, but it is {check.short(rates)}.")
+        moving = {name: getattr(computer, name) for name in rates}
         times = t + h * jnp.arange(substeps, dtype=dtype)
-        return board._replace(**jax.lax.scan(one, moving, (times, stages))[0])
+        return computer._replace(**jax.lax.scan(one, moving, (times, stages))[0])
 
     @jax.checkpoint
-    def tick(board, told):
+    def tick(computer, told):
         k, y, stages = told
         now = Now(k, k.astype(dtype) * dt, dt)
-        after, log = decide(params, now, board, y)
-        after = like(after, board, "decide")
+
+        def one(computer, y):
+            out = decide(params, now, computer, y)
+            if not isinstance(out, tuple) or len(out) != 2:
+                raise TypeError(f"`decide` must return computer, log, but it is {check.short(out)}.")
+            return match_state(out[0], computer, "decide"), jax.tree.map(jnp.asarray, out[1])
+
+        after, log = alone(one, computer, y)
         ahead = after if flow is None else flown(now.t, after, y, stages)
         return ahead, (after, log)
 
     ticks = jnp.arange(len(jax.tree.leaves(readings)[0]))
-    return jax.lax.scan(tick, board, (ticks, readings, between))[1]
+    return jax.lax.scan(tick, computer, (ticks, readings, between))[1]
 
 
 # files
@@ -266,10 +281,27 @@ def resample(t, columns: Mapping[str, Any], *, dt: float, ticks: int | None = No
     return out
 
 
-@door
 def together(readings: Mapping[str, Reading], names) -> Reading:
-    """Channels as one reading of shape (ticks, channels), in the order of the names."""
+    """Channels as one reading of shape (ticks, channels), in the order of the names.
+
+    Raises ValueError for a name that is no channel and channels of different lengths; TypeError for what is no mapping
+    of names to `Reading`.
+    """
+    check.mapping("readings", readings)
+    names = list(names) if np.iterable(names) else []
+    if not names:
+        check.refuse("names", "be at least one channel", check.short(names))
     for name in names:
-        if name not in readings:
+        if name not in list(readings):
             check.refuse("names", f"be channels ({', '.join(map(str, readings))})", check.short(name))
+        check.kind(f"readings[{name!r}]", readings[name], Reading)
+        shapes = {
+            np.shape(leaf)
+            for other in (names[0], name)
+            for leaf in check.numbers(f"readings[{other!r}]", readings[other])
+        }
+        if len(shapes) > 1 or len(next(iter(shapes))) != 1:
+            check.refuse(
+                f"readings[{name!r}]", "have shape (ticks,), that of the others", f"of shapes {sorted(shapes)}"
+            )
     return jax.tree.map(lambda *a: np.stack(a, axis=1), *(readings[name] for name in names))

@@ -1,9 +1,9 @@
 """Tallies: what a sweep keeps of a run instead of its trajectory.
 
-A score is one pure function (params, scenario, now, log) -> tree of tallies. The tally of a whole run is the
-sum of those of its ticks, and `values` turns the sum into numbers. The defaults of a tally's fields are those
-of an empty run. A NaN in the log stays visible: means, extremes and final values become NaN, `always` False. value,
-condition: numbers of the tick, shape (*lanes); inside: bool, whether the tick lies in the window.
+A score is one pure function (params, scenario, now, log) -> tree of tallies, of one scenario and one tick. The tally of
+a whole run is the sum of those of its ticks, and `values` turns the sum into numbers. The defaults of a tally's fields
+are those of a run without ticks. A NaN in the log stays visible: means, extremes and final values become NaN, `always`
+False. value, condition: a number of the tick, or an array of any shape, which that of the result is; inside: bool, whether the tick lies in the window.
 
 May import: check, vec.
 """
@@ -15,15 +15,15 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxatt.check import door, short
+from jaxatt.check import short
 from jaxatt.vec import safe_sqrt
 
 
 class Mean(NamedTuple):
     """Mean over the ticks of a window; NaN if it held none."""
 
-    total: Any = 0.0  # (*lanes) sum so far
-    ticks: Any = 0.0  # (*lanes) number of ticks in it
+    total: Any = 0.0  # [unit of the value] sum so far
+    ticks: Any = 0.0  # [1] number of ticks in it
 
     def __add__(self, later):
         return Mean(self.total + later.total, self.ticks + later.ticks)
@@ -36,8 +36,8 @@ class Mean(NamedTuple):
 class Rms(NamedTuple):
     """Root mean square over the ticks of a window; NaN if it held none."""
 
-    total: Any = 0.0  # (*lanes) sum of squares so far
-    ticks: Any = 0.0  # (*lanes) number of ticks in it
+    total: Any = 0.0  # [unit of the value, squared] sum of squares so far
+    ticks: Any = 0.0  # [1] number of ticks in it
 
     def __add__(self, later):
         return Rms(self.total + later.total, self.ticks + later.ticks)
@@ -49,7 +49,7 @@ class Rms(NamedTuple):
 class Peak(NamedTuple):
     """Largest value in a window; NaN if it held no tick."""
 
-    largest: Any = -jnp.inf  # (*lanes)
+    largest: Any = -jnp.inf  # [unit of the value]
 
     def __add__(self, later):
         return Peak(jnp.maximum(self.largest, later.largest))
@@ -61,7 +61,7 @@ class Peak(NamedTuple):
 class First(NamedTuple):
     """First time [s] at which something held; inf if never."""
 
-    t: Any = jnp.inf  # (*lanes) [s]
+    t: Any = jnp.inf  # [s]
 
     def __add__(self, later):
         return First(jnp.minimum(self.t, later.t))
@@ -73,8 +73,8 @@ class First(NamedTuple):
 class Settling(NamedTuple):
     """Last time [s] outside a band in a window; 0 if never, inf if still outside at its end, NaN if it held no tick."""
 
-    outside: Any = -jnp.inf  # (*lanes) [s] last time outside
-    end: Any = -jnp.inf  # (*lanes) [s] last time in the window
+    outside: Any = -jnp.inf  # [s] last time outside
+    end: Any = -jnp.inf  # [s] last time in the window
 
     def __add__(self, later):
         return Settling(jnp.maximum(self.outside, later.outside), jnp.maximum(self.end, later.end))
@@ -87,7 +87,7 @@ class Settling(NamedTuple):
 class Always(NamedTuple):
     """Whether something held at every tick."""
 
-    held: Any = True  # (*lanes) bool
+    held: Any = True  # bool
 
     def __add__(self, later):
         return Always(self.held & later.held)
@@ -99,7 +99,7 @@ class Always(NamedTuple):
 class Final(NamedTuple):
     """Value at the last tick."""
 
-    last: Any = jnp.nan  # (*lanes)
+    last: Any = jnp.nan  # [unit of the value]
 
     def __add__(self, later):
         return later
@@ -112,54 +112,46 @@ def _where(inside, value, otherwise):
     return value if inside is True else jnp.where(inside, value, otherwise)
 
 
-@door
 def mean(value, inside: Any = True) -> Mean:
     """Tally the mean of value (a bool gives a share) over the ticks where ``inside`` holds."""
     value = jnp.asarray(value, jnp.result_type(value, 1.0))
     return Mean(_where(inside, value, 0), jnp.broadcast_to(jnp.asarray(inside, value.dtype), value.shape))
 
 
-@door
 def rms(square, inside: Any = True) -> Rms:
     """Tally a root mean square where ``inside`` holds; takes the square, for instance ``log.q @ log.q``."""
     return Rms(*mean(square, inside))
 
 
-@door
 def peak(value, inside: Any = True) -> Peak:
     """Tally the largest value over the ticks where ``inside`` holds."""
     return Peak(_where(inside, value, -jnp.inf))
 
 
-@door
 def first(now, condition, since: Any = 0.0) -> First:
     """Tally the first time [s], counted from ``since``, at which the condition holds."""
     return First(jnp.where(condition, now.t - since, jnp.inf))
 
 
-@door
 def settling(now, outside, inside: Any = True) -> Settling:
     """Tally the settling time [s]: the last time at which ``outside`` holds, in the window ``inside``."""
     end = _where(inside, jnp.broadcast_to(now.t, jnp.shape(outside)), -jnp.inf)
     return Settling(jnp.where(outside, end, -jnp.inf), end)
 
 
-@door
 def always(condition) -> Always:
     """Tally whether the condition holds at every tick."""
     return Always(condition)
 
 
-@door
 def final(value) -> Final:
     """Tally the value at the last tick."""
     return Final(value)
 
 
-@door
 def finite(tree):
-    """Whether every number of a tree of (*lanes) leaves is finite, shape (*lanes)."""
-    total = sum(jax.tree.leaves(tree))  # one inf or NaN makes the sum inf or NaN
+    """Whether every number of a tree is finite."""
+    total = sum(jnp.sum(leaf) for leaf in jax.tree.leaves(tree))  # one inf or NaN makes the sum inf or NaN
     return jnp.isfinite(total)
 
 
@@ -191,8 +183,8 @@ def values(tree):
 class Span(NamedTuple):
     """Largest minus smallest value in a window; NaN if it held no tick."""
 
-    largest: Any = -jnp.inf  # (*lanes)
-    smallest: Any = jnp.inf  # (*lanes)
+    largest: Any = -jnp.inf  # [unit of the value]
+    smallest: Any = jnp.inf  # [unit of the value]
 
     def __add__(self, later):
         return Span(jnp.maximum(self.largest, later.largest), jnp.minimum(self.smallest, later.smallest))
@@ -201,7 +193,6 @@ class Span(NamedTuple):
         return jnp.where(self.largest == -jnp.inf, jnp.nan, self.largest - self.smallest)
 
 
-@door
 def span(value, inside: Any = True) -> Span:
     """Tally how far apart the extremes of value lie over the ticks where ``inside`` holds."""
     return Span(_where(inside, value, -jnp.inf), _where(inside, value, jnp.inf))
@@ -213,7 +204,7 @@ def span(value, inside: Any = True) -> Span:
 class Total(NamedTuple):
     """Sum over the ticks of a window; 0 if it held none."""
 
-    total: Any = 0.0  # (*lanes) sum so far
+    total: Any = 0.0  # [unit of the value] sum so far
 
     def __add__(self, later):
         return Total(self.total + later.total)
@@ -225,8 +216,8 @@ class Total(NamedTuple):
 class PeakTime(NamedTuple):
     """Time [s] of the first largest value; NaN if there was no tick."""
 
-    largest: Any = -jnp.inf  # (*lanes)
-    t: Any = jnp.nan  # (*lanes) [s]
+    largest: Any = -jnp.inf  # [unit of the value]
+    t: Any = jnp.nan  # [s]
 
     def __add__(self, later):
         higher = later.largest > self.largest
@@ -236,13 +227,11 @@ class PeakTime(NamedTuple):
         return self.t
 
 
-@door
-def total(value, inside=True) -> Total:
+def total(value, inside: Any = True) -> Total:
     """Tally the sum of value over the ticks where ``inside`` holds."""
     return Total(_where(inside, jnp.asarray(value, jnp.result_type(value, 1.0)), 0))
 
 
-@door
 def peak_time(now, value) -> PeakTime:
     """Tally the time [s] of the largest value."""
     return PeakTime(value, jnp.broadcast_to(now.t, jnp.shape(value)))

@@ -1,26 +1,70 @@
-"""Sensor triads: how star sensors and gyros read, faults included.
+"""Sensors: how star sensors and gyros read, faults included, and where gyros point.
 
-May import: check, vec, attitude, faults, mounting, scores.
+May import: check, vec, attitude, faults, scores.
 """
 
 from __future__ import annotations
 
-from jaxatt.check import door
-from jaxatt.faults import channel, read
-from jaxatt.vec import Vec3
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxatt.faults import Reading, channel, read
+from jaxatt.vec import Vec3, array, cross, resultant
 
 
-@door
 def triad(faults: Vec3, t, std, normals, last: Vec3) -> Vec3:
     """The three channels of a star sensor or rate gyro from tick time t [s] on, a `Vec3` of `Channel`.
 
-    faults: `Vec3` of `Fault`; std: standard deviation of each channel's noise; normals: standard normal numbers
-    of shape (3, *lanes); last: the previous reading.
+    faults: `Vec3` of `Fault`; std: standard deviation of each channel's noise; normals: three standard normal numbers;
+    last: the previous reading.
     """
     return Vec3(*(channel(f, t, std, n, v) for f, n, v in zip(faults, normals, last)))
 
 
-@door
 def read_triad(channels: Vec3, truth: Vec3) -> Vec3:
     """The reading of a triad whose true signals are ``truth``."""
     return Vec3(*map(read, channels, truth))
+
+
+def quantised(y, step):
+    """y rounded to whole multiples of step, 0 for no rounding; gradients pass the rounding over."""
+    coarse = step > 0
+    safe = jnp.where(coarse, step, 1)
+    return y + jax.lax.stop_gradient(jnp.where(coarse, safe * jnp.round(y / safe) - y, 0))
+
+
+# where gyros point
+
+
+def gyro_pyramid(alpha, beta) -> tuple[Vec3, Vec3, Vec3, Vec3]:
+    """Input axes of the gyros A, B, C about -z and of the spare D along z; Park (2005), eq. (1).
+
+    alpha: [rad] between A, B, C and -z; 54.7356 deg with beta = 60 deg makes the three an orthogonal triad;
+    beta: [rad] azimuth of B and C from y.
+    """
+    sa, ca, sb, cb = jnp.sin(alpha), jnp.cos(alpha), jnp.sin(beta), jnp.cos(beta)
+    return Vec3(0.0, -sa, -ca), Vec3(sb * sa, cb * sa, -ca), Vec3(-sb * sa, cb * sa, -ca), Vec3(0.0, 0.0, 1.0)
+
+
+def parity_vector(axes):
+    """Unit v, shape (4,), with v' G = 0 for four axes no three of which lie in a plane; first v positive.
+
+    v' y of four gyros is free of the body rate: it holds errors only, but one number cannot tell whose.
+    """
+    a, b, c, d = axes
+    v = jnp.stack([cross(b, c) @ d, -(cross(a, c) @ d), cross(a, b) @ d, -(cross(a, b) @ c)])
+    return v * (jnp.sign(v[0]) / jnp.sqrt(jnp.sum(v * v)))
+
+
+def rate_maps(axes):
+    """Pseudo-inverses, (2^n, 3, n), of n gyro axes for every subset in use; gyro i counts 2^i in its number."""
+    n = len(axes)
+    in_use = np.arange(2**n)[:, None] >> np.arange(n) & 1  # (2^n, n)
+    return jnp.linalg.pinv(jnp.stack([array(axis) for axis in axes]) * in_use[..., None], rtol=1e-5)
+
+
+def rate_from(maps, gyro: Reading) -> Vec3:
+    """The body rate [rad/s] that explains the valid ones of n gyro readings (n,) best; maps: of `rate_maps`."""
+    subset = sum(valid << i for i, valid in enumerate(gyro.valid.astype(int)))
+    return resultant(maps[subset], jnp.where(gyro.valid, gyro.value, 0))

@@ -1,6 +1,6 @@
 """Make the recorded data of notebook `recorded_data`: ``python -m notebooks.telemetry``.
 
-Three minutes of a geostationary satellite's day (`jaxatt.systems.gyro_ekf`), as a ground station would have it: 8 Hz
+Three minutes of a geostationary satellite's day (`jaxatt.loops.gyro_ekf`), as a ground station would have it: 8 Hz
 with jitter, the earth sensor at half that rate, one row in a hundred lost and three seconds without contact. One of
 the four gyros fails; `truth` says which, when and how, and the file does not.
 """
@@ -13,8 +13,8 @@ import jax
 import numpy as np
 
 import jaxatt
+from jaxatt.loops import gyro_ekf as loop
 from jaxatt.replay import EXAMPLE
-from jaxatt.systems import gyro_ekf as loop
 
 SECONDS = 180
 GAP = (61.0, 64.0)  # [s] no contact
@@ -27,7 +27,7 @@ def truth() -> tuple[int, float, float]:
 
 
 def scenario() -> loop.Scenario:
-    """The day: as in the paper's Table 6, with the fault, of which nobody tells the board."""
+    """The day: as in the paper's Table 6, with the fault, of which nobody tells the computer."""
     who, onset, size = truth()
     here = np.arange(4) == who
     return loop.scenario._replace(
@@ -40,7 +40,7 @@ def recorded() -> dict[str, np.ndarray]:
 
     def tick(params, scenario, now, x, z, noise):
         x, z, _ = loop.tick(params, scenario, now, x, z, noise)
-        return x, z, (z.readings, z.board.u)
+        return x, z, (z.readings, z.computer.u)
 
     ticks = round(SECONDS / loop.DT)
     params = loop.consistent(loop.params)
@@ -69,5 +69,5 @@ def write(path: Path = EXAMPLE) -> None:
 
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)
-    jaxatt.fast_cpu()
+    jaxatt.configure()
     write()

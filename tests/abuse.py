@@ -1,5 +1,7 @@
 """What the abuse of public entries shares: how an answer is judged, and what a user may hand in.
 
+What meets a user's data answers with a result or with one line that names the argument, raised by our own code with no
+word from inside JAX. Parts of loops have no such duty: there JAX and Python say, with the traceback, what went wrong.
 50 examples per entry in ``test_fuzz*.py``; ``JAXATT_FUZZ=2000 pytest -n 2 tests/test_fuzz*.py`` is the long run.
 """
 
@@ -17,18 +19,18 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
 import jaxatt
-from jaxatt import check, vec
+from jaxatt import check
 from jaxatt.faults import Fault
-from jaxatt.vec import Mat3, Quat, Vec3
+from jaxatt.vec import Vec3
 
 EXAMPLES = int(os.environ.get("JAXATT_FUZZ", "50"))
 HOME = str(Path(jaxatt.__file__).parent)
 fuzzed = settings(
-    max_examples=EXAMPLES, deadline=None, derandomize=True, database=None, suppress_health_check=list(HealthCheck)
-)
-compiled = []
-jax.monitoring.register_event_duration_secs_listener(
-    lambda event, *_, **__: compiled.append(event) if "backend_compile" in event else None
+    max_examples=EXAMPLES,
+    deadline=None,
+    derandomize=True,
+    database=None,
+    suppress_health_check=list(HealthCheck),  # pyright: ignore[reportArgumentType]
 )
 
 
@@ -98,7 +100,7 @@ def tuples(kind, part=None, n=None):
     part = plain() if part is None else part
     n = len(kind._fields) if n is None else n
     whole = st.tuples(*[part] * n).map(lambda parts: kind(*parts))
-    same = arrays([(n,), (n, 2)]).map(lambda a: kind(*a))  # lanes that agree
+    same = arrays([(n,), (n, 2)]).map(lambda a: kind(*a))  # fields of one shape
     return st.one_of(same, whole, same, junk)
 
 
@@ -111,7 +113,6 @@ def nearly(draw, good, wild):
     return made
 
 
-vectors, quaternions = tuples(Vec3), tuples(Quat)
-matrices = st.one_of(arrays([(3, 3), (3, 3, 2)]).map(vec.mat3), tuples(Mat3, vectors), junk)
+vectors = tuples(Vec3)
 whole = st.one_of(st.integers(-3, 6), st.sampled_from([2**31, 10**30, 2.0, 1.5, True, "3", None, np.int64(2), np.nan]))
 fault = st.one_of(tuples(Fault), st.tuples(plain(), plain()).map(lambda a: Fault(onset=a[0], bias=a[1])), junk)

@@ -1,12 +1,18 @@
-"""Scores of a log that no loop has written."""
+"""What tests share: scores of a log that no loop has written, equal scenarios, the count of compilations."""
 
 from functools import reduce
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxatt import scores
-from jaxatt.engine import Now
+from jaxatt.contract import Now
+
+compilations = []  # one entry for every program that XLA has compiled, or found in its cache, so far
+jax.monitoring.register_event_duration_secs_listener(
+    lambda event, *_, **__: compilations.append(event) if "backend_compile" in event else None
+)
 
 
 def tallied(score, params, scenario, log, dt):
@@ -14,3 +20,8 @@ def tallied(score, params, scenario, log, dt):
     ticks = len(jax.tree.leaves(log)[0])
     one = lambda k: score(params, scenario, Now(k, k * dt, dt), jax.tree.map(lambda a: jnp.asarray(a)[k], log))
     return scores.values(reduce(scores.add, map(one, jnp.arange(ticks))))
+
+
+def repeated(tree, n):
+    """n equal scenarios, every leaf (n, ...)."""
+    return jax.tree.map(lambda a: np.broadcast_to(np.asarray(a), (n, *np.shape(a))), tree)

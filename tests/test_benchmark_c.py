@@ -11,7 +11,7 @@ import pytest
 from benchmarks import observer_pd as bench
 from benchmarks.measure import c_library
 from jaxatt import noise_of, sweep
-from jaxatt.systems.observer_pd import params, score
+from jaxatt.loops.observer_pd import params, score
 from jaxatt.vec import Vec3
 
 jax.config.update("jax_enable_x64", True)
@@ -68,7 +68,7 @@ def test_c_draws_standard_normal_noise(libraries):
     one, other = run(1), run(2)
     ours = sweep(loop, params, s, jax.random.key(0), ticks=TICKS, score=score)
     assert np.all(one.ok == 1) and np.any(one.rms_w != other.rms_w)
-    for name in ("rms_q_ill", "rms_w_ill", "rms_u_ill", "miss"):
+    for name in ("rms_q_faulty", "rms_w_faulty", "rms_u_faulty", "miss"):
         a, b, c = (np.nanmean(getattr(x, name)) for x in (one, other, ours))
         assert abs(a - c) < 0.05 * c and abs(b - c) < 0.05 * c, name
 

@@ -4,19 +4,25 @@ import os
 import subprocess
 import sys
 import time
-from concurrent.futures import Executor, Future
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
 import pytest
+import xarray as xr
+import zarr
 
 from benchmarks import tiny_campaign as tiny
-from jaxatt import campaign as module
 from jaxatt import simulate, sweep
-from jaxatt.campaign import dataset, extend, replay, run, scenarios, until
-from jaxatt.summary import failing
+from jaxatt.campaign import dataset, extend, rerun, run, scenarios, until, workers
+from jaxatt.campaign.draw import checked, results
+from jaxatt.campaign.provenance import environment
+from jaxatt.campaign.store import lock_file
+from jaxatt.campaign.summary import failing
 
 ROOT = Path(__file__).parents[1]
 BLOCKS, N = 8, 8 * 128
@@ -41,7 +47,7 @@ def whole(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def swept():
-    """The sweep of the same scenarios; the one that the door refuses is replaced."""
+    """The sweep of the same scenarios; the one that the check refuses is replaced."""
     many = scenarios(tiny.campaign(), 0, N)
     many = many._replace(start=np.where(np.arange(N) == 300, 0.0, many.start))
     return sweep(tiny.system, tiny.Params(), many, KEY, ticks=30, score=tiny.score)
@@ -51,26 +57,53 @@ def test_scores_are_those_of_the_sweep_and_inputs_those_of_the_scenarios(whole, 
     ds, many = dataset(whole), scenarios(tiny.campaign(), 0, N)
     others = np.arange(N) != 300
     for name, values in swept._asdict().items():
-        assert same(ds[name].values[..., others], values[..., others]), name
+        assert same(ds[name].values[..., others], np.moveaxis(values, 0, -1)[..., others]), name
     plain = ~np.isin(np.arange(N), [5, 300])
     for name in ("start", "push"):
         assert same(ds[name].values[plain], getattr(many, name)[plain])
     assert len(np.unique(ds.start.values)) == N  # nobody twice
-    assert ds.rms.attrs == {"role": "score", "units": "m"} and ds.last.dims == ("last_0", "scenario")
+    assert ds["last"].dims == ("last_0", "scenario")
 
 
-def test_failing_scenarios_are_kept_listed_and_replayed(whole):
+def test_units_come_from_the_fields_and_the_campaign_adds_to_them(whole, tmp_path):
+    ds = dataset(whole)
+    units = {name: variable.attrs.get("units") for name, variable in ds.data_vars.items()}
+    assert units == dict(status=None, rms="m", far="s", last="m, m/s", ok=None, start="m", push=None)
+    nested = lambda *words: dict(main=tiny.score(*words), other=tiny.score(*words).rms)
+    c = tiny.campaign(score=nested, record=lambda log: log, every=10, units={"main.far": "0.1 s"})
+    ds = run(tmp_path / "x.zarr", c, 128)
+    assert [ds[name].attrs.get("units") for name in ("main.rms", "main.far", "other", "x", "v")] == [
+        "m", "0.1 s", None, "m", "m/s",
+    ]  # fmt: skip
+
+
+@pytest.mark.filterwarnings("error")
+def test_plain_xarray_opens_a_store_and_writes_it_as_netcdf(whole, tmp_path):
+    run(tmp_path / "grown.zarr", tiny.campaign(), 200)
+    extend(tmp_path / "grown.zarr", tiny.campaign(), N)
+    for path in (whole, tmp_path / "grown.zarr"):
+        plain, ours = xr.open_zarr(path), dataset(path)
+        assert same_data(plain[list(ours.data_vars)], ours)
+        assert plain.attrs == ours.attrs and json.loads(ours.attrs["campaign"])["n"] == N
+    ours.to_netcdf(tmp_path / "x.nc")
+    back = xr.open_dataset(tmp_path / "x.nc")
+    assert back.attrs == ours.attrs
+    for name in ours.data_vars:
+        np.testing.assert_array_equal(back[name].values, ours[name].values)
+
+
+def test_failing_scenarios_are_kept_listed_and_rerun(whole):
     ds = dataset(whole)
     assert failing(ds).tolist() == [5, 300]
     assert ds.status.values[[5, 300]].tolist() == [1, 2] and ds.status.values.sum() == 3
-    log = replay(whole, tiny.campaign(), 5)
+    log = rerun(whole, tiny.campaign(), 5)
     assert not np.isfinite(log.x).all() and not ds.ok.values[5]
 
 
-def test_a_replay_is_the_run_that_was_scored(whole, tmp_path):
+def test_a_rerun_is_the_run_that_was_scored(whole, tmp_path):
     ds = dataset(whole)
     for index in (0, 127, 128, N - 1):
-        log = replay(whole, tiny.campaign(), index)
+        log = rerun(whole, tiny.campaign(), index)
         assert log.x.shape == (30,)
         assert [log.x[-1], log.v[-1]] == ds["last"].values[:, index].tolist()
         outside = np.flatnonzero(np.abs(log.x) > 1)
@@ -80,7 +113,7 @@ def test_a_replay_is_the_run_that_was_scored(whole, tmp_path):
     assert ds.position.dims == ("time", "scenario") and ds.time.attrs["units"] == "s"
     np.testing.assert_allclose(ds.time.values, 0.7 * np.arange(5))
     for index in (3, 130):
-        assert same(ds.position.values[:, index], np.asarray(replay(tmp_path / "r.zarr", recorded, index).x)[::7])
+        assert same(ds.position.values[:, index], np.asarray(rerun(tmp_path / "r.zarr", recorded, index, every=7).x))
 
 
 def test_however_it_is_cut_the_numbers_are_the_same(whole, tmp_path):
@@ -95,8 +128,8 @@ def test_however_it_is_cut_the_numbers_are_the_same(whole, tmp_path):
     assert same_data(extend(tmp_path / "grown.zarr", c, N), ds)
     assert tiny.files(tmp_path / "grown.zarr") == tiny.files(whole)
     for block in (0, 5):  # any block, by itself
-        again = module._results(module._admitted(c), block * 128, (block + 1) * 128)
-        assert all(same(again[k], ds[k].values[..., block * 128 : (block + 1) * 128]) for k in ds.data_vars)
+        again = results(checked(c), block * 128, (block + 1) * 128)
+        assert all(same(again[str(k)], ds[k].values[..., block * 128 : (block + 1) * 128]) for k in ds.data_vars)
 
 
 DEVICES = """
@@ -122,7 +155,7 @@ def test_two_dask_workers_give_the_same_bits_and_one_may_be_killed(whole, tmp_pa
         distributed.Client(cluster) as client,
         client.get_executor() as executor,
     ):
-        first, write = [], module.write_block
+        first, write = [], workers.write_block
 
         def kill_one(*args):
             write(*args)
@@ -130,11 +163,11 @@ def test_two_dask_workers_give_the_same_bits_and_one_may_be_killed(whole, tmp_pa
                 first.append(next(iter(cluster.workers.values())).pid)
                 os.kill(first[0], 9)
 
-        module.write_block = kill_one
+        workers.write_block = kill_one
         try:
             ds = run(tmp_path / "dask.zarr", tiny.campaign(), N, executor=executor)
         finally:
-            module.write_block = write
+            workers.write_block = write
     assert first and same_data(ds, dataset(whole))
     assert tiny.files(tmp_path / "dask.zarr") == tiny.files(whole)
 
@@ -164,10 +197,19 @@ def test_a_lost_worker_is_reported_and_the_work_resumed(whole, tmp_path):
 
 
 def test_a_worker_unlike_its_master_is_refused(tmp_path):
-    _, payload = module._environment(), b""
-    other = module._environment() | {"XLA_FLAGS": "--xla_other"}
+    _, payload = environment(), b""
+    other = environment() | {"XLA_FLAGS": "--xla_other"}
     with pytest.raises(ValueError, match="`executor` must have workers like this process, but these differ: XLA_FLAGS"):
-        module._task(payload, other, 0, 128)
+        workers._task(payload, other, 0, 128)
+
+
+def test_a_pool_that_forks_is_refused(tmp_path):
+    with (
+        ProcessPoolExecutor(1, mp_context=get_context("fork")) as pool,
+        pytest.raises(ValueError, match=r"`executor` must start its processes anew: .*mp_context=get_context\(\"spawn"),
+    ):
+        run(tmp_path / "x.zarr", tiny.campaign(), 128, executor=pool)
+    assert not (tmp_path / "x.zarr").exists()
 
 
 def test_killed_at_random_moments_and_resumed(tmp_path):
@@ -283,13 +325,14 @@ def test_two_writers_of_one_block_are_refused_and_disjoint_shards_are_not(whole,
     )
     lock = path.with_name("x.zarr.lock")
     with subprocess.Popen([sys.executable, "-c", hold, lock], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+        assert other.stdout is not None
         other.stdout.readline()  # it holds blocks 4 to 7
         with pytest.raises(RuntimeError, match="must have one writer for a block, but another process is writing"):
             run(path, tiny.campaign(), N)
         run(path, tiny.campaign(), N, shard=(0, 2))
         other.kill()
     assert same_data(run(path, tiny.campaign(), N), dataset(whole))  # the lock died with its holder
-    with module.lock_file(path), pytest.raises(RuntimeError, match="this process is writing to"):
+    with lock_file(path), pytest.raises(RuntimeError, match="this process is writing to"):
         run(path, tiny.campaign(), N)
 
 
@@ -309,7 +352,7 @@ def test_another_campaign_is_refused_by_name(whole, tmp_path, monkeypatch):
     with pytest.raises(ValueError, match=r"`n` must be the 1024 scenarios of the store \(or more, in `extend`\)"):
         run(path, tiny.campaign(), N + 1)
     with pytest.raises(ValueError, match=r"these differ: system\.dt"):
-        replay(path, tiny.campaign(system=tiny.system._replace(dt=0.2)), 3)
+        rerun(path, tiny.campaign(system=tiny.system._replace(dt=0.2)), 3)
     assert tiny.files(path) == before
 
     def sample(key, index):  # another code under the same name
@@ -327,10 +370,14 @@ def test_a_difference_may_be_accepted(whole, tmp_path):
     run(path, tiny.campaign(), N, shard=(0, 2))
     file = path / "zarr.json"
     content = json.loads(file.read_text())
-    content["attributes"]["campaign"]["jaxlib"] = "0.0.1"
+    manifest = json.loads(content["attributes"]["campaign"])
+    content["attributes"]["campaign"] = json.dumps(manifest | {"jaxlib": "0.0.1"})
     file.write_text(json.dumps(content))
     with pytest.raises(ValueError, match="jaxlib is"):
         run(path, tiny.campaign(), N)
+    with pytest.raises(ValueError, match="jaxlib is"):
+        rerun(path, tiny.campaign(), 3)
+    assert same(rerun(path, tiny.campaign(), 3, accept=["jaxlib"]).x, rerun(whole, tiny.campaign(), 3).x)
     assert same_data(run(path, tiny.campaign(), N, accept=["jaxlib"]), dataset(whole))
 
 
@@ -342,14 +389,15 @@ def test_what_is_no_campaign_is_refused(tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(ValueError, match="`path` must be the store of a campaign, but"):
         run(tmp_path / "empty", tiny.campaign(), 10)
-    for change, message in (
+    refused: list[tuple[dict[str, Any], str]] = [
         (dict(block=100), "`campaign.block` must be a multiple of 128, but it is 100"),
         (dict(ticks=0), "`campaign.ticks` must be a whole number of at least 1, but it is 0"),
         (dict(size=9), "`n` must not exceed the 9 points of the design, but it is 10"),
         (dict(units={"rsm": "m"}), "`campaign.units` must name scores, inputs or records"),
         (dict(params=tiny.Params(gain=-1.0)), "`params.gain` must be a positive number, but it is -1"),
         (dict(inputs=lambda key, index: dict(rms=1.0)), "`input.rms` must have a name of its own"),
-    ):
+    ]
+    for change, message in refused:
         with pytest.raises(ValueError, match=message):
             run(tmp_path / "x.zarr", tiny.campaign(**change), 10)
     with pytest.raises(ValueError, match=r"`shard` must be \(k, m\) with k < m, but it is \(3, 3\)"):
@@ -360,8 +408,10 @@ def test_what_is_no_campaign_is_refused(tmp_path):
 def test_left_while_it_grew(whole, tmp_path, monkeypatch):
     path = tmp_path / "x.zarr"
     run(path, tiny.campaign(), 200)
-    group = module.zarr.open_group(path, mode="r+")
-    group["rms"].resize((N,))  # as far as a killed `extend` came
+    group = zarr.open_group(path, mode="r+")
+    rms = group["rms"]
+    assert isinstance(rms, zarr.Array)
+    rms.resize((N,))  # as far as a killed `extend` came
     with pytest.raises(RuntimeError, match="was left while it grew"):
         dataset(path)
     assert run(path, tiny.campaign(), 200).sizes["scenario"] == 200
@@ -389,6 +439,6 @@ def test_float32_stays_float32(tmp_path):
     c = tiny.campaign(params=small, sample=single, inputs=None, units={})
     ds = run(tmp_path / "x.zarr", c, 130)
     assert ds.rms.dtype == np.float32
-    some = jax.tree.map(lambda a: a[..., [0, 129]], scenarios(c, 0, 130))
-    log = simulate(tiny.system, small, some, jax.random.split(KEY, 2), ticks=1)
+    one = jax.tree.map(lambda a: a[129], scenarios(c, 0, 130))
+    log = simulate(tiny.system, small, one, KEY, ticks=1)
     assert log.x.dtype == np.float32

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import kstest, qmc
 
-from jaxatt import designs
+from jaxatt.campaign import designs
 
 KEY = jax.random.key(5)
 

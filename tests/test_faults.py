@@ -3,7 +3,21 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxatt.faults import Fault, active, any_active, channel, check_fault, dead, first_onset, on_axes, read
+from jaxatt import fields
+from jaxatt.faults import (
+    Fault,
+    Reading,
+    active,
+    any_active,
+    channel,
+    dead,
+    dead_where,
+    faults_of,
+    first_onset,
+    healthy,
+    on_axes,
+    read,
+)
 from jaxatt.sensors import read_triad, triad
 from jaxatt.vec import Vec3
 
@@ -36,13 +50,40 @@ def test_every_kind_between_onset_and_end_only(fault, expected):
     assert bool(active(fault, 4.0)) and not bool(active(fault._replace(end=4.0), 4.0))
 
 
-def test_kinds_are_data_in_lanes_and_axes_are_apart():
-    faults = Vec3(Fault(onset=jnp.array([0.0, jnp.inf]), bias=jnp.array([1.0, 1.0])), Fault(), dead())
-    channels = triad(faults, 1.0, 0.0, jnp.zeros((3, 2)), Vec3(0.0, 0.0, 0.0))
-    y = read_triad(channels, Vec3(5.0, 6.0, 7.0))
-    np.testing.assert_array_equal(np.broadcast_arrays(*y), [[6, 5], [6, 6], [0, 0]])
-    assert first_onset(faults).tolist() == [0, 0]
-    assert any_active([faults.x, faults.y], 1.0).tolist() == [True, False]
+def test_a_kind_without_an_onset_is_there_from_the_start():
+    assert Fault(bias=0.1) == Fault(onset=0.0, bias=0.1) and Fault(end=3.0).onset == 0
+    assert Fault().onset == np.inf and not bool(active(Fault(), 1e9))
+    assert Fault()._replace(bias=0.1).onset == np.inf
+    assert jax.tree.map(lambda a: a, Fault(bias=0.1)) == Fault(bias=0.1)
+    assert jax.tree.map(lambda a: None, Fault()).onset is None  # given is given
+    with pytest.raises(TypeError, match="colour"):
+        Fault(colour=3.0)  # pyright: ignore[reportCallIssue]
+
+
+def test_a_healthy_and_a_dead_channel():
+    assert read(healthy(), TRUTH) == TRUTH
+    assert reading(dead(2.0, 9.0)) == pytest.approx(NOISY) and reading(dead()) == 0
+
+
+def test_axes_are_apart():
+    faults = Vec3(Fault(0.0, bias=1.0), Fault(), dead())
+    y = read_triad(triad(faults, 1.0, 0.0, jnp.zeros(3), Vec3(0.0, 0.0, 0.0)), Vec3(5.0, 6.0, 7.0))
+    assert jax.tree.leaves(jax.tree.map(float, y)) == [6.0, 6.0, 0.0]
+    assert on_axes(dead()) == Vec3(dead(), dead(), dead())
+
+
+def test_kinds_are_data():
+    one = lambda *kinds: read(channel(Fault(kinds[0], bias=1.0, scale=kinds[1]), 1.0, 0.0, 0.0, 0.0), TRUTH)
+    found = jax.vmap(one)(jnp.array([0.0, jnp.inf, 0.0]), jnp.array([1.0, 1.0, 0.5]))
+    assert found.tolist() == [3.0, 2.0, 2.0]
+
+
+def test_the_faults_of_any_tree_are_found():
+    early, late = Fault(2.0, 3.0, bias=1.0), Fault(5.0)
+    tree = dict(gyro=on_axes(late), star=(early, 7.0), wheel=Reading(1.0, True))
+    assert faults_of(tree) == [late, late, late, early] and faults_of(early) == [early]
+    assert first_onset(tree) == 2 and first_onset(Fault()) == np.inf
+    assert [bool(any_active(tree, t)) for t in (1.0, 2.0, 3.0, 5.0)] == [False, True, False, True]
 
 
 def test_gradients_of_a_healthy_and_a_faulty_channel_are_finite():
@@ -60,10 +101,17 @@ def test_gradients_of_a_healthy_and_a_faulty_channel_are_finite():
         (Fault(random=-1.0), r"`gyro\.random` must not be negative, but it is -1\."),
         (Fault(stuck=0.5), r"`gyro\.stuck` must be one of \(0, 1\), but it is 0\.5\."),
         (Fault(onset=5.0, end=4.0), r"`gyro\.end` must not lie before the onset, but it is 4\."),
-        (Fault(bias=np.array([0.0, np.nan])), r"`gyro\.bias` must be a number, but it is nan in scenario 1\."),
+        (Fault(drift=np.nan), r"`gyro\.drift` must be a number, but it is nan\."),
     ],
 )
 def test_a_fault_that_makes_no_sense_is_refused(fault, message):
     with pytest.raises(ValueError, match=message):
-        check_fault("gyro", fault)
-    check_fault("gyro", on_axes(Fault(onset=3.0)).x)
+        fields.validate("gyro", fault)
+    fields.validate("gyro", on_axes(Fault(onset=3.0)))
+
+
+def test_those_of_a_mask_are_dead_from_the_onset_on():
+    fault = dead_where([0, 1, 0], 5.0)
+    assert all(np.shape(leaf) == (3,) for leaf in jax.tree.leaves(fault))
+    for t, kept in ((4.9, [1, 1, 1]), (5.0, [1, 0, 1]), (1e6, [1, 0, 1])):
+        np.testing.assert_array_equal(read(channel(fault, t, 0.0, 0.0, 0.0), 7.0), 7.0 * np.array(kept))

@@ -16,8 +16,7 @@ from abuse import JUNK, fuzzed, judged, junk, nearly, plain, whole
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxatt.campaign import dataset, extend, run, sampling_key, scenarios, until
-from jaxatt.campaign import replay as rerun
+from jaxatt.campaign import dataset, extend, rerun, run, sampling_key, scenarios, until
 from jaxatt.replay import load
 from jaxatt.tuning import tune
 

@@ -10,9 +10,9 @@ from matplotlib.lines import Line2D
 from matplotlib.text import Text
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
-from jaxatt import Fault, detection, on_axes, plot
+from jaxatt import Fault, evaluation, on_axes, plot
 from jaxatt import singularity as sg
-from jaxatt.systems import cmg_loss, observer_pd
+from jaxatt.loops import cmg_loss, observer_pd
 from jaxatt.vec import Vec3
 
 RNG = np.random.default_rng(5)
@@ -48,7 +48,7 @@ FIGURES = {
     "overview": overview,
     "heat_map": lambda: plot.heat_map(DATA, "size [rad/s]", "onset [s]", "seen [1]", log=("size [rad/s]",), chance=0.1),
     "sweep_summary": lambda: plot.sweep_summary(DATA, ["delay [s]", "onset [s]"]),
-    "roc": lambda: plot.roc({"a": detection.roc(RNG.normal(size=99), 1 + RNG.normal(size=99))}, samples=10),
+    "roc": lambda: plot.roc({"a": evaluation.roc(RNG.normal(size=99), 1 + RNG.normal(size=99))}, samples=10),
     "pareto": lambda: plot.pareto(DATA, "size [rad/s]", "onset [s]", marked={"paper": 0, "tuned": 1}),
     "subsets": lambda: plot.subsets(OUT, {"settling [s]": {"a": np.arange(16.0), "b": np.full(16, np.inf)}}),
     "singular_surface": lambda: plot.singular_surface(cmg_loss.scenario.axes, 1, fine=12),
@@ -117,6 +117,7 @@ def test_the_heat_map_is_the_mean_of_each_cell():
     z = np.where(np.arange(50) == 7, np.nan, RNG.normal(size=50))
     ax = plot.heat_map({"x [s]": x, "y [m]": y, "z [1]": z}, "x [s]", "y [m]", "z [1]", bins=9, log=("x [s]",))
     shown = ax.collections[0].get_array()
+    assert shown is not None
     edges = np.linspace(np.log(x).min(), np.log(x).max(), 10), np.linspace(y.min(), y.max(), 10)
     good = np.isfinite(z)
     count = np.histogram2d(np.log(x[good]), y[good], edges)[0].T
@@ -173,7 +174,7 @@ def test_the_surface_reaches_as_far_as_the_cluster(reversed, monkeypatch):
         (lambda: plot.overview([0.0, 1.0], {"residual": [0.0, 1.0]}), r"`label` must end in a unit.*'residual'"),
         (lambda: plot.heat_map(DATA, "nothing", "onset [s]", "seen [1]"), r"`name` must be one of size.*'nothing'"),
         (lambda: plot.heat_map(DATA, "size [rad/s]", "onset [s]", "seen [1]", bins=0), "`bins` must be a whole number"),
-        (lambda: plot.heat_map({"a [s]": np.zeros(3)}, *["a [s]"] * 3, log=("a [s]",)), r"`a \[s\]` must be a positive"),
+        (lambda: plot.heat_map({"a [s]": np.zeros(3)}, *["a [s]"] * 3, log=("a [s]",)), r"`data\['a \[s\]'\]\[0\]` must be a positive"),
         (lambda: plot.sweep_summary({"delay": np.ones(3)}), "`label` must end in a unit"),
         (lambda: plot.roc({}, samples=0), "`samples` must be a whole number"),
     ],

@@ -1,4 +1,4 @@
-"""Recorded readings through on-board code: the same board as in the closed loop, and a door for files."""
+"""Recorded readings through on-board code: the computer knows what it knew in the closed loop; files."""
 
 from typing import Any, NamedTuple
 
@@ -8,11 +8,12 @@ import numpy as np
 import pandas
 import pytest
 
-from jaxatt import Now, Reading, Vec3, rk4, simulate
-from jaxatt.estimators import AttitudeRate
+from jaxatt import Now, Reading, Vec3, simulate
+from jaxatt.faults import dead_where
+from jaxatt.loops import cmg_loss, gyro_ekf, observer_pd, star_isolation, wheel_mrac
+from jaxatt.observers import AttitudeRate
 from jaxatt.replay import checked, load, replay, resample, together
 from jaxatt.sensors import read_triad
-from jaxatt.systems import cmg_loss, gyro_ekf, observer_pd, star_isolation, wheel_mrac
 
 KEY = jax.random.key(4)
 TICKS = 120
@@ -29,7 +30,6 @@ class Case(NamedTuple):
     scenario: Any
     told: Any  # (scenario, now, x, z before, z after, noise) -> readings of a tick
     flow: Any = None
-    moving: tuple = ()  # fields of x that are the board's
     read: Any = None  # (scenario, x, z) -> readings between ticks
 
 
@@ -46,77 +46,80 @@ OBSERVER = observer_pd.scenario._replace(
     gyro=Vec3(*(f._replace(onset=4.0) for f in observer_pd.scenario.gyro)),
     star=Vec3(*(f._replace(onset=8.0) for f in observer_pd.scenario.star)),
 )
-EKF = gyro_ekf.scenario._replace(gyro=gyro_ekf.failed([False, True, False, False], 5.0))
+EKF = gyro_ekf.scenario._replace(gyro=dead_where([False, True, False, False], 5.0))
 STAR = star_isolation.scenario._replace(
     star=jax.tree.map(lambda a: np.where(a == 100.0, 6.0, a), star_isolation.scenario.star)
 )
 CMG = cmg_loss.scenario._replace(std_w=1e-4)
 WHEEL = wheel_mrac.scenario._replace(tacho_noise=1.0, drive=wheel_mrac.Fault(onset=1.0, scale=0.5))
-sees = lambda module: lambda s, now, x, z, after, noise: module.sense(module.params, s, now, x, z, noise)
 CASES = {
     "observer_pd": Case(observer_pd, observer_pd.system, observer_pd.decide, OBSERVER,
-                        lambda s, now, x, z, after, noise: after.sensors.y, observer_pd.board_flow, ("estimate",), observer_reads),
-    "gyro_ekf": Case(gyro_ekf, gyro_ekf.system, gyro_ekf.decide, EKF, sees(gyro_ekf)),
-    "cmg_loss": Case(cmg_loss, cmg_loss.system, cmg_loss.decide, CMG, sees(cmg_loss)),
+                        lambda s, now, x, z, after, noise: after.sensors.y, observer_pd.computer_flow, observer_reads),
+    "gyro_ekf": Case(gyro_ekf, gyro_ekf.system, gyro_ekf.decide, EKF,
+                     lambda s, now, x, z, after, noise: gyro_ekf.sense(gyro_ekf.params, s, now, x, z, noise)),
+    "cmg_loss": Case(cmg_loss, cmg_loss.system, cmg_loss.decide, CMG,
+                     lambda s, now, x, z, after, noise: cmg_loss.sense(cmg_loss.params, s, now, x, z, noise)),
     "star_isolation": Case(star_isolation, star_isolation.system, star_isolation.decide, STAR,
                            lambda s, now, x, z, after, noise: after.sensors.readings),
     "wheel_mrac": Case(wheel_mrac, wheel_mrac.system, wheel_mrac.decide, WHEEL,
-                       lambda s, now, x, z, after, noise: after.sensors.readings, wheel_mrac.board_flow, ("mrac", "turns"), wheel_reads),
+                       lambda s, now, x, z, after, noise: after.sensors.readings, wheel_mrac.computer_flow, wheel_reads),
     "wheel_mrac, sampled": Case(wheel_mrac, wheel_mrac.sampled, wheel_mrac.decide_sampled, WHEEL,
                                 lambda s, now, x, z, after, noise: after.sensors.readings,
-                                wheel_mrac.board_flow_sampled, ("mrac", "turns"), wheel_reads),
+                                wheel_mrac.computer_flow_sampled, wheel_reads),
 }  # fmt: skip
 
 
 class Run(NamedTuple):
     """What a closed loop was told and remembered."""
 
-    start: Any  # board before the first tick
+    start: Any  # the computer before the first tick
     told: Any  # readings at the ticks
     between: Any  # at every stage of RK4; None where nothing moves on board
-    boards: Any  # after each decide
+    computers: Any  # after each decide
     log: Any
 
 
 def recorded(case, ticks=TICKS) -> Run:
-    """A closed loop run by the engine; where the board flows, written down once more to see its readings there."""
+    """A closed loop run by the engine; where the computer flows, written down once more to see its readings there."""
     system, params, scenario = case.system, case.loop.params, jax.tree.map(jnp.asarray, case.scenario)
     noise = jax.random.normal(KEY, (ticks, system.normals))
 
     def tick(params, scenario, now, x, z, n):
         x_after, after, log = system.tick(params, scenario, now, x, z, n)
-        moving = {name: getattr(x_after, name) for name in case.moving}
-        return x_after, after, (case.told(scenario, now, x, z, after, n), after.board._replace(**moving), log)
+        return x_after, after, (case.told(scenario, now, x, z, after, n), case.loop.computer_of(x_after, after), log)
 
     start = jax.tree.map(lambda a: jnp.asarray(a, jnp.result_type(a)), system.init(params, scenario))
+    known = case.loop.computer_of(*start)
     if not case.flow:
-        told, boards, log = simulate(system._replace(tick=tick), params, scenario, noise, ticks=ticks)
-        return Run(start[1].board, told, None, boards, log)
+        told, computers, log = simulate(system._replace(tick=tick), params, scenario, noise, ticks=ticks)
+        return Run(known, told, None, computers, log)
     h = system.dt / system.substeps
 
     def step(state, kn):
         now = Now(kn[0], kn[0] * system.dt, system.dt)
-        x, z, out = tick(params, scenario, now, *state, kn[1])
+        x, z, out = tick(params, scenario, now, *state, n=kn[1])
 
         def substep(x, t):
-            seen = []
-
-            def flow(t, x):
-                seen.append(case.read(scenario, x, z))
-                return system.flow(params, scenario, t, x, z)
-
-            return rk4(flow, t, x, h), jax.tree.map(lambda *a: jnp.stack(a), *seen)
+            ahead = lambda k, by: jax.tree.map(lambda a, b: a + by * h * b, x, k)
+            seen, slopes, k = [], [], jax.tree.map(jnp.zeros_like, x)
+            for by in (0, 0.5, 0.5, 1):
+                there = ahead(k, by)
+                seen.append(case.read(scenario, there, z))
+                k = system.flow(params, scenario, t + by * h, there, z)
+                slopes.append(k)
+            mean = jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, *slopes)
+            return ahead(mean, 1), jax.tree.map(lambda *a: jnp.stack(a), *seen)
 
         x, between = jax.lax.scan(substep, x, now.t + h * jnp.arange(system.substeps))
         return (x, z), (*out, between)
 
-    told, boards, log, between = jax.jit(lambda: jax.lax.scan(step, start, (jnp.arange(ticks), noise))[1])()
-    return Run(start[1].board, told, between, boards, log)
+    told, computers, log, between = jax.jit(lambda: jax.lax.scan(step, start, (jnp.arange(ticks), noise))[1])()
+    return Run(known, told, between, computers, log)
 
 
 @pytest.fixture(scope="module", params=CASES)
 def run(request):
-    """A case, its run, and the boards and words of the replay."""
+    """A case, its run, and the computers and logs of the replay."""
     case = CASES[request.param]
     run = recorded(case)
     grid = dict(dt=case.system.dt, flow=case.flow, substeps=case.system.substeps, between=run.between)
@@ -132,27 +135,30 @@ def close(a, b, rtol=1e-9):
             np.testing.assert_allclose(x, y, rtol=rtol, atol=rtol * max(np.abs(x).max(), 1e-30))
 
 
-def test_the_board_of_a_replay_is_that_of_the_closed_loop(run):
-    _, run, boards, _ = run
-    close(run.boards, boards)
+def test_the_computer_of_a_replay_is_that_of_the_closed_loop(run):
+    _, run, computers, _ = run
+    close(run.computers, computers)
 
 
 def test_so_is_what_it_says(run):
-    case, (*_, log), boards, said = run
+    case, (*_, log), computers, said = run
     if case.loop is observer_pd:
         close((log.xi, log.alarm), said)
         assert log.alarm[40:].all() and not log.alarm[:40].all()
     elif case.loop is star_isolation:
-        close(log.board, said)
-        assert log.board.latched[-1].tolist() == [True, False]
+        close(log.verdict, said)
+        assert log.verdict.latched[-1].tolist() == [True, False]
     elif case.loop is wheel_mrac:
         close((log.residual, log.alarm, log.flipped), said)
         assert log.alarm[60:].any() and log.alarm[:25].sum() < 25
     elif case.decide is gyro_ekf.decide:
         (met, suspicion), f = said, log.filter
-        close((f.nis, f.rows, f.nll, f.statistic, f.parity), (*met, suspicion.gyro, suspicion.parity))
+        close(
+            (f.nis, f.rows, f.nll, f.statistic, f.parity),
+            (met.nis, met.rows, met.nll, suspicion.gyro, suspicion.parity),
+        )
     else:
-        close(log.u, jnp.clip(boards.u, -1, 1) * np.array([1, 1, 1, 0]))
+        close(log.u, jnp.clip(computers.u, -1, 1) * np.array([1, 1, 1, 0]))
 
 
 def test_the_loop_written_down_once_more_is_the_shipped_one():
@@ -168,9 +174,11 @@ class Lag(NamedTuple):
 def lag(k, **how):
     """A lag of 1 s behind sin(k t), told every 0.1 s for 3 s."""
     t = 0.1 * np.arange(31)
-    flow = lambda params, board, y: dict(x=y - board.x)
-    boards, _ = replay(lambda params, now, board, y: (board, ()), (), Lag(0.0), np.sin(k * t), dt=0.1, flow=flow, **how)
-    return t, np.asarray(boards.x)
+    flow = lambda params, computer, y: dict(x=y - computer.x)
+    computers, _ = replay(
+        lambda params, now, computer, y: (computer, ()), (), Lag(0.0), np.sin(k * t), dt=0.1, flow=flow, **how
+    )
+    return t, np.asarray(computers.x)
 
 
 def test_readings_are_held_between_ticks():
@@ -187,17 +195,15 @@ def test_finer_readings_are_used_where_there_are_some():
     np.testing.assert_allclose(x, (np.sin(3 * t) - 3 * np.cos(3 * t) + 3 * np.exp(-t)) / 10, atol=1e-6)
 
 
-def test_lanes_maps_and_gradients_go_through():
-    told = np.random.default_rng(1).normal(size=(20, 3))
-    decide = lambda params, now, board, y: (board + params * (y - board), now.t)
-    run = lambda told, start, params=0.3: replay(decide, params, start, told, dt=0.1)
-    lanes, t = run(told, np.zeros(3))
-    np.testing.assert_allclose(t, 0.1 * np.arange(20), atol=1e-15)
-    mapped = jax.vmap(run, (1, 0), (1, None))(told, np.zeros(3))[0]
-    for i in range(3):
-        np.testing.assert_allclose(run(told[:, i], 0.0)[0], lanes[:, i], rtol=1e-14)
-        np.testing.assert_allclose(mapped[:, i], lanes[:, i], rtol=1e-14)
-    end = lambda params: run(told[:, 0], 0.0, params)[0][-1]
+def test_maps_and_gradients_go_through():
+    told = np.random.default_rng(1).normal(size=(3, 20))
+    decide = lambda params, now, computer, y: (computer + params * (y - computer), now.t)
+    run = lambda told, params=0.3: replay(decide, params, 0.0, told, dt=0.1)
+    mapped, t = jax.vmap(run)(told)
+    for one, times, y in zip(mapped, t, told):
+        np.testing.assert_allclose(run(y)[0], one, rtol=1e-14)
+        np.testing.assert_allclose(times, 0.1 * np.arange(20), atol=1e-15)
+    end = lambda params: run(told[0], params)[0][-1]
     assert jax.grad(end)(0.3) == pytest.approx(float(end(0.3 + 1e-6) - end(0.3 - 1e-6)) / 2e-6, rel=1e-6)
 
 
@@ -214,14 +220,14 @@ def test_lanes_maps_and_gradients_go_through():
 )  # fmt: skip
 def test_bad_recordings_are_refused(change, message):
     given = dict(readings={"a": np.ones(3)}, dt=0.1) | change
-    decide = lambda params, now, board, y: (board + y["a"], board)
+    decide = lambda params, now, computer, y: (computer + y["a"], computer)
     with pytest.raises(ValueError, match=message):
         replay(decide, (), 0.0, **given)
 
 
-def test_a_board_that_changes_its_kind_is_refused():
+def test_a_computer_that_changes_its_kind_is_refused():
     with pytest.raises(TypeError, match="`decide` must return"):
-        replay(lambda params, now, board, y: ((board, y), ()), (), 0.0, np.ones(3), dt=0.1)
+        replay(lambda params, now, computer, y: ((computer, y), ()), (), 0.0, np.ones(3), dt=0.1)
 
 
 # samples

@@ -5,7 +5,17 @@ import pytest
 import xarray as xr
 from scipy.stats import binom
 
-from jaxatt.summary import Rate, describe, failing, first_order, narrowed, quantiles, rate_of, rates, sensitivity
+from jaxatt.campaign.summary import (
+    Rate,
+    describe,
+    failing,
+    first_order,
+    narrowed,
+    quantiles,
+    rate_of,
+    rates,
+    sensitivity,
+)
 
 
 def test_the_interval_covers_the_rate_whatever_it_is():
@@ -109,5 +119,6 @@ def test_a_dataset_in_numbers_and_words(made):
     text = describe(made)
     assert text.startswith("2000 scenarios done: 1998 good, 1 failed, 1 refused; share not good 0.001 (")
     assert "not good: 104, 109\n" in text and "delay [s]: 5 %, 50 %, 95 %: " in text
+    assert "\nnone: NaN in every scenario" in text
     assert "driven by size 1.00" in text and "finite driven by size" in text
     assert describe(made.isel(scenario=slice(0))) == "0 scenarios are done"

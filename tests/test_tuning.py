@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,13 +15,13 @@ import optax
 import pytest
 
 from jaxatt import Fault, System, Vec3, on_axes, scores, simulate, sweep
-from jaxatt.controllers import Steering
-from jaxatt.objectives import soft_alarm
-from jaxatt.systems import cmg_loss as cmg
-from jaxatt.systems import gyro_ekf as ge
-from jaxatt.systems import observer_pd as op
-from jaxatt.systems import star_isolation as si
-from jaxatt.systems import wheel_mrac as wm
+from jaxatt.cmg import Steering
+from jaxatt.loops import cmg_loss as cmg
+from jaxatt.loops import gyro_ekf as ge
+from jaxatt.loops import observer_pd as op
+from jaxatt.loops import star_isolation as si
+from jaxatt.loops import wheel_mrac as wm
+from jaxatt.soft_scores import soft_alarm
 from jaxatt.tuning import (
     FEW,
     averaged,
@@ -114,6 +115,8 @@ def test_many_starts_find_the_deeper_basin_and_a_dead_one_costs_nothing():
     alone, single = tune(cost, {"x": -1.3, "y": np.ones(2)}, optax.adam(0.05), 150, KEY)
     np.testing.assert_allclose(history.cost[:, 0], single.cost, rtol=1e-6)
     thetas, costs = best_of(history)
+    with pytest.raises(ValueError, match=r"`history.cost` must have shape \(steps, starts\)"):
+        best_of(single)
     assert thetas["x"][0] == pytest.approx(float(alone["x"]), abs=1e-6) and costs[1] == np.inf
     with pytest.raises(ValueError, match="`cost` must be finite, with a finite gradient, at the start"):
         multi_start(cost, {"x": np.full(2, 9.0), "y": np.ones((2, 2))}, optax.adam(0.05), 3, KEY)
@@ -128,14 +131,14 @@ KILLED = """
 import os, signal, sys
 sys.path.insert(0, "tests")
 import conftest, test_tuning as t
-from jaxatt import tuning
+from jaxatt.tuning import search
 replaced = []
 def die_at_the_ninth(beside, path, replace=os.replace):
     replaced.append(path)
     if len(replaced) == 9:
         os.kill(os.getpid(), signal.SIGKILL)  # the ninth file is written and not yet renamed
     replace(beside, path)
-tuning.os.replace = die_at_the_ninth
+search.os.replace = die_at_the_ninth
 t.long_run(sys.argv[1])
 """
 
@@ -157,9 +160,10 @@ def test_a_killed_and_resumed_run_equals_an_uninterrupted_one(tmp_path):
         assert len(held["history1"]) == 8
     resumed = long_run(file)
     assert same_bits(resumed, long_run(None)) and same_bits(resumed, long_run(file))
-    for other in (
+    others: list[dict[str, Any]] = [
         dict(key=jax.random.key(1)), dict(x=0.3), dict(rate=0.2), dict(cost=lambda theta, key: 2 * wavy(theta, key)),
-    ):  # fmt: skip
+    ]  # fmt: skip
+    for other in others:
         with pytest.raises(ValueError, match="`save` must hold a search of the same cost, start, optimizer, key and"):
             long_run(file, **other)
     with pytest.raises(ValueError, match=r"`steps` must not be fewer than the 40 that .* holds, but it is 12"):
@@ -284,8 +288,8 @@ def observer_pd(theta, key):
 
 def gyro_ekf_pid(theta, key):
     """The loop as shipped, its Kalman filter included."""
-    scaled = {k: jnp.exp(v) * Vec3(*map(jnp.asarray, getattr(ge.params, k))) for k, v in theta.items() if k != "R"}
-    p = ge.params._replace(**scaled, R=jnp.exp(theta["R"]) * jnp.asarray(ge.params.R))
+    scaled = {k: jnp.exp(v) * getattr(ge.params, k) for k, v in theta.items()}
+    p = ge.params._replace(**scaled)
     log = simulate(ge.system, p, ge.scenario, key, ticks=16)
     return 1e9 * jnp.mean(log.angle @ log.angle) + 1e6 * jnp.mean(log.w @ log.w)
 
@@ -311,7 +315,7 @@ def wheel_adaptation(theta, key):
         K=jnp.exp(theta["K"]), law=wm.params.law._replace(gamma=1e-6 * jnp.exp(theta["gamma"])),
         P0=1e-6 * jnp.exp(theta["P0"]),
     )  # fmt: skip
-    log = simulate(wm.loop(substeps=8), p, wm.scenario, key, ticks=60)
+    log = simulate(wm.system_of(substeps=8), p, wm.scenario, key, ticks=60)
     return jnp.mean(log.error**2) + 1e-8 * jnp.mean(log.step**2)
 
 

@@ -74,7 +74,8 @@ def test_mcnemar_is_the_binomial_test_of_the_discordant_pairs():
 
 
 @pytest.mark.parametrize(
-    "bad, words", [([1.0, np.inf], "`after` must be finite"), ([1.0, 2.0, 3.0], "one shape"), ([1.0], "one shape")]
+    "bad, words",
+    [([1.0, np.inf], r"`after\[1\]` must be finite"), ([1.0, 2.0, 3.0], "one shape"), ([1.0], "one shape")],
 )
 def test_what_cannot_be_paired_is_refused(bad, words):
     for paired in (compare.paired_mean, compare.paired_ratio):
@@ -149,8 +150,7 @@ def test_the_dearer_of_two_calls_is_told():
 
 def test_a_contest_runs_every_baseline_and_draws_it(tmp_path):
     pytest.importorskip("cma")
-    report = Report(tmp_path, quick=True)
-    report.start("bowl")
+    report = Report(tmp_path, True, "bowl")
     start = np.array([-1.0, 0.0])
     x, points = start, [start]
     for _ in range(20):

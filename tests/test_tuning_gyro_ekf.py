@@ -11,7 +11,7 @@ from experiments.gyro_ekf import SUBSETS
 from experiments.tuning import gyro_ekf as study
 from jaxatt import tune
 from jaxatt.linear import growth_rates
-from jaxatt.systems.gyro_ekf import INERTIA, params
+from jaxatt.loops.gyro_ekf import INERTIA, params
 
 
 @pytest.fixture(scope="module")
@@ -21,7 +21,7 @@ def nominal():
 
 def test_the_sampled_loop_is_affine_in_the_gains(nominal):
     factors = np.random.default_rng(3).uniform(0.2, 5, 9)
-    there = study.linearised(factors, study.at_rest(INERTIA))
+    there = study.linearised(factors, np.array(INERTIA))
     np.testing.assert_allclose(study.matrix(nominal, np.log(factors), np.arange(16)), there, atol=1e-12)
 
 
@@ -71,6 +71,6 @@ def test_pid_keeps_the_integral_time_and_levels_go_where_they_belong():
 def test_every_seed_brings_other_days_and_all_subsets():
     days = [study.drawn(seed, range(16), 2) for seed in (study.TUNE, study.CHOOSE, study.VERDICT)]
     assert len({float(day.w.x[0]) for day in days}) == 3
-    onset = days[0].gyro.onset.reshape(4, 16, 2)
-    assert (np.isfinite(onset).sum(0) == np.array([[len(s)] for s in SUBSETS])).all()
-    np.testing.assert_array_equal(days[0].h[:, :2], days[0].h[:, 2:4])  # the same states for every subset
+    onset = days[0].gyro.onset.reshape(16, 2, 4)
+    assert (np.isfinite(onset).sum(-1) == np.array([[len(s)] for s in SUBSETS])).all()
+    np.testing.assert_array_equal(days[0].h[:2], days[0].h[2:4])  # the same states for every subset

@@ -1,19 +1,21 @@
 """A loop small enough to be written out in NumPy: a noisy oscillator under sampled feedback."""
 
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax.numpy as jnp
 
-from jaxatt.engine import System, every
+from jaxatt.check import finite, not_negative
+from jaxatt.contract import System
+from jaxatt.engine import every
 
 
 class Params(NamedTuple):
-    gain: Any = 0.3
+    gain: Annotated[Any, "1/s", finite] = 0.3
 
 
 class Scenario(NamedTuple):
-    start: Any = 1.0
-    stiffness: Any = 4.0
+    start: Annotated[Any, "m", finite] = 1.0
+    stiffness: Annotated[Any, "1/s^2", not_negative] = 4.0
 
 
 class X(NamedTuple):
@@ -31,12 +33,12 @@ def init(params, scenario):
 
 
 def tick(params, scenario, now, x, z, noise):
-    u = every(3, now, lambda: -params.gain * (x.speed + 0.1 * noise[0]) + 0.01 * noise[1], z)
+    u = every(3, now, lambda: -(params.gain * (x.speed + 0.1 * noise[0])) + 0.01 * noise[1], z)
     return x, u, Log(x.position, u)
 
 
 def flow(params, scenario, t, x, z):
-    return X(x.speed, -scenario.stiffness * x.position + z + 0.05 * jnp.sin(t))
+    return X(x.speed, z - scenario.stiffness * x.position + 0.05 * jnp.sin(t))
 
 
 SYSTEM = System(init, tick, flow, dt=0.2, substeps=3, normals=2)

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from experiments.cmg_loss import COLOURS, SKEW, stacked
+from experiments.cmg_loss import FOUR, LOOKS, informed, stacked
 from experiments.report import plt
 from experiments.tuning.compare import (
     contest,
@@ -30,10 +30,11 @@ from experiments.tuning.compare import (
     paired_share,
     told,
 )
-from jaxatt import scores, simulate, sweep, tune
-from jaxatt.controllers import Steering
-from jaxatt.systems import cmg_loss as cmg
-from jaxatt.systems.cmg_loss import DT, PROPER, Params
+from jaxatt import scores, simulate, sweep, tune, varied
+from jaxatt.cmg import Steering
+from jaxatt.loops import cmg_loss as cmg
+from jaxatt.loops.cmg_loss import DT, PROPER, Params
+from jaxatt.plot import COLOURS, LINES, MARKS
 from jaxatt.vec import Vec3
 
 TUNE, CHOOSE, VERDICT = range(3)  # seeds
@@ -66,9 +67,9 @@ LITTLE, STEP = 1e-6, 1e-2  # steps in ln K_P: of a central difference, and of a 
 
 
 class Case(NamedTuple):
-    """A scenario and what flies in it, so that designs lie in lanes beside each other."""
+    """A scenario and what flies in it, so that a batch holds designs beside each other."""
 
-    rounded: Any  # () 1: the drives follow u_max tanh(u / u_max), 0: u clipped to u_max
+    rounded: Any  # 1: the drives follow u_max tanh(u / u_max), 0: u clipped to u_max
     params: Params
     day: cmg.Scenario
 
@@ -77,7 +78,7 @@ def rounded_tick(_, case: Case, now, x, z, noise):
     """A tick of the loop, the corners of the drives' limit rounded where the case says so."""
     x, z, log = cmg.tick(case.params, case.day, now, x, z, noise)
     most = case.day.u_max
-    smooth = jnp.where(cmg.failed(case.day, now), 0, most * jnp.tanh(z.board.u / most))
+    smooth = jnp.where(cmg.failed(case.day, now), 0, most * jnp.tanh(z.computer.u / most))
     return x, z._replace(drive=z.drive._replace(u=jnp.where(case.rounded > 0, smooth, z.drive.u))), log
 
 
@@ -89,23 +90,23 @@ CASES = SYSTEM._replace(
 )
 
 
-def curves(log_factor, cases: Case, ticks: int):
-    """Costs over time, K_P times exp(log_factor (lanes,)): one number a second, two costs of shape (seconds, lanes).
+def curves(log_factor, case: Case, ticks: int):
+    """Costs over time, K_P times exp(log_factor): one number a second, two costs of shape (seconds,).
 
     Rate: integral of |w|^2 / |w(0)|^2 [s]. Wear: total variation of the gimbal rates [rad/s].
     """
-    changed = cases.params._replace(k_p=cases.params.k_p * jnp.exp(log_factor))
-    keys = jax.random.split(KEY, log_factor.shape[-1])
-    log = simulate(CASES, (), cases._replace(params=changed), keys, ticks=ticks)
+    changed = case.params._replace(k_p=case.params.k_p * jnp.exp(log_factor))
+    log = simulate(CASES, (), case._replace(params=changed), KEY, ticks=ticks)
     square = log.w @ log.w
     each = round(1 / DT)
-    return jnp.cumsum(square, 0)[each::each] * DT / square[0], jnp.cumsum(log.variation, 0)[each::each]
+    return jnp.cumsum(square)[each::each] * DT / square[0], jnp.cumsum(log.variation)[each::each]
 
 
 @partial(jax.jit, static_argnums=2)
-def along(log_factor, cases, ticks):
-    """`curves`, and their derivatives by ln K_P."""
-    return jax.jvp(lambda a: curves(a, cases, ticks), (log_factor,), (jnp.ones_like(log_factor),))
+def along(log_factors, cases: Case, ticks):
+    """`curves` of cases (n, ...), and their derivatives by ln K_P: two pairs of arrays (n, seconds)."""
+    one = lambda f, case: jax.jvp(lambda a: curves(a, case, ticks), (f,), (jnp.ones_like(f),))
+    return jax.vmap(one)(log_factors, cases)
 
 
 def evidence(report) -> None:
@@ -115,14 +116,15 @@ def evidence(report) -> None:
     cases = []
     for structure, gamma in STARTS.values():
         moved = np.array(gamma) + SPREAD * rng.uniform(-1, 1, (n, 4)) * (np.arange(4) < 3) * (np.arange(n) > 0)[:, None]
-        cases += [Case(*law, cmg.lost(SKEW[structure], g)) for law in LAWS.values() for g in moved]
+        days = [cmg.lost(FOUR[structure], g) for g in moved]
+        cases += [Case(rounded, *informed(params, day)) for rounded, params in LAWS.values() for day in days]
     cases = stacked(cases)
     zero = np.zeros(len(STARTS) * len(LAWS) * n)
     shape = (len(HORIZONS), len(STARTS), len(LAWS), n)
 
     def at(step):
         both = along(zero + step, cases, ticks)
-        return [[np.asarray(a)[HORIZONS - 1].reshape(shape) for a in costs] for costs in both]
+        return [[np.asarray(a).T[HORIZONS - 1].reshape(shape) for a in costs] for costs in both]
 
     gradient = at(0.0)[1]
     little = [(up - down) / (2 * LITTLE) for up, down in zip(at(LITTLE)[0], at(-LITTLE)[0])]
@@ -147,9 +149,9 @@ def evidence(report) -> None:
     report.within("gradient / central difference - 1, smooth start", None, 1e-5, error, "float64, both costs, to 60 s")
     m = len(zero) // len(LAWS)
     factors = np.geomspace(0.8, 1.25, m)
-    exact = cmg.lost(SKEW["pyramid"], STARTS["pyramid, shaking"][1])
+    exact = cmg.lost(FOUR["pyramid"], STARTS["pyramid, shaking"][1])
     ridge = stacked([Case(*law, exact) for law in LAWS.values() for _ in range(m)])
-    terrain = [np.asarray(a)[-1].reshape(-1, m) for a in along(np.tile(np.log(factors), 3), ridge, ticks)[0]]
+    terrain = [np.asarray(a)[:, -1].reshape(-1, m) for a in along(np.tile(np.log(factors), 3), ridge, ticks)[0]]
     evidence_figure(report, gradient[0], step[0], honest[0], factors, terrain[1])
 
 
@@ -157,11 +159,12 @@ def evidence_figure(report, gradient, step, told_right, factors, wear) -> None:
     """Of the rate cost: gradient and real step over the horizon, how often they agree; and the wear over K_P."""
     fig, axes = plt.subplots(3, 3, figsize=(12, 9), layout="constrained", sharey="row")
     for j, law in enumerate(LAWS):
-        for i, (start, colour, dash) in enumerate(zip(STARTS, COLOURS, ("-", "--", "-.", ":"))):
-            look = dict(color=colour, ls=dash, marker="o", ms=4)
+        for i, (start, colour, line, mark) in enumerate(zip(STARTS, COLOURS, LINES, MARKS)):
+            look = dict(color=colour, ls=line, marker=mark, ms=4)
             axes[0, j].plot(HORIZONS, np.median(np.abs(gradient[:, i, j]), -1), label=start, **look)
-            axes[0, j].plot(HORIZONS, np.median(np.abs(step[:, i, j]), -1), "o", color=colour, mfc="none", ms=8)
-            axes[1, j].plot(HORIZONS, told_right[:, i, j].mean(-1), **look)
+            axes[0, j].plot(HORIZONS, np.median(np.abs(step[:, i, j]), -1), mark, color=colour, mfc="none", ms=9)
+            apart = 0.02 * (i - 1.5)  # or one curve would hide another
+            axes[1, j].plot(HORIZONS, told_right[:, i, j].mean(-1) + apart, **look)
         axes[0, j].set(title=law, yscale="log", ylim=(1e-5, 1e12))
         axes[1, j].set(ylim=(-0.05, 1.05))
         for ax in axes[:2, j]:
@@ -169,11 +172,13 @@ def evidence_figure(report, gradient, step, told_right, factors, wear) -> None:
             ax.set_xticks(HORIZONS, [str(h) for h in HORIZONS])
             ax.minorticks_off()
         axes[2, j].plot(factors, wear[j], color=COLOURS[1], marker=".", lw=0.8)
-        axes[2, j].set(xlabel="$K_P$ / the paper's", yscale="log", ylim=(0.5 * wear.min(), 2 * wear.max()))
+        axes[2, j].set(xlabel="$K_P$ / the paper's [1]", yscale="log", ylim=(0.5 * wear.min(), 2 * wear.max()))
         for ax in axes[:, j]:
             ax.grid(alpha=0.3)
-    axes[0, 0].set_ylabel("|d rate cost / d ln $K_P$| [s], median;\nrings: a 1 % step")
-    axes[1, 0].set_ylabel(f"share of {gradient.shape[-1]} starts where the\ngradient tells a 1 % step to 20 %")
+    axes[0, 0].set_ylabel("|d rate cost / d ln $K_P$| [s], median;\nhollow: a 1 % step")
+    axes[1, 0].set_ylabel(
+        f"share of {gradient.shape[-1]} starts where the\ngradient tells a 1 % step to 20 % [1]\n(curves 0.02 apart)"
+    )
     axes[2, 0].set_ylabel("wear over 60 s from pyramid\n[-95, 90, 85, 95] deg [rad/s]")
     axes[0, 0].legend(fontsize=8, loc="upper left")
     report.figure("where_the_gradient_lies", fig)
@@ -191,17 +196,19 @@ START = np.concatenate([np.log([0.2, 0.02, 0.01, 10.0, 0.1]), np.zeros(6)])
 
 
 def momenta(seed: int, n: int) -> np.ndarray:
-    """Initial total momenta, (3, 2 n) [N m s]: the same n for the pyramid and for box-90."""
-    h = STD_H * np.random.default_rng([seed, 11]).normal(size=(3, n))
-    return np.tile(h, 2)
+    """Initial total momenta, (n, 3) [N m s]."""
+    return STD_H * np.random.default_rng([seed, 11]).normal(size=(3, n)).T
 
 
 def days(h, shift):
-    """Scenarios of both structures: momenta h (3, 2 n), healthy gimbals rearranged by shift (2, 3) [rad]."""
-    n = h.shape[-1] // 2
-    base = stacked([cmg.lost(SKEW[name], gamma) for name, gamma in BASES.items() for _ in range(n)])
-    moved = jnp.repeat(jnp.concatenate([shift, jnp.zeros((2, 1))], axis=1).T, n, axis=1, total_repeat_length=2 * n)
-    return base._replace(h=Vec3(*h), gamma=base.gamma + moved)
+    """Scenarios (2 n, ...): momenta h (n, 3) in the pyramid, then in box-90, gimbals rearranged by shift (2, 3) [rad]."""
+
+    def of(day, shift):
+        moved = day.gamma + jnp.append(shift, 0.0)  # the lost module is not rearranged
+        return jax.vmap(lambda h: day._replace(h=Vec3.of(h), gamma=moved))(h)
+
+    both = [of(cmg.lost(FOUR[name], gamma), a) for (name, gamma), a in zip(BASES.items(), shift)]
+    return jax.tree.map(lambda *a: jnp.concatenate(a), *both)
 
 
 def design(theta) -> tuple[Params, Any]:
@@ -212,11 +219,14 @@ def design(theta) -> tuple[Params, Any]:
 
 
 def costs(params: Params, scenarios):
-    """Rate's energy over its start, priced wear added, of every run, (lanes,)."""
-    n = scenarios.gamma.shape[-1]
-    log = simulate(SYSTEM, params, scenarios, jax.random.split(KEY, n), ticks=round(SECONDS / DT))
-    square = log.w @ log.w
-    return jnp.sum(square, 0) * DT / square[0] + WEAR * SECONDS * jnp.mean(log.acceleration, 0)
+    """Rate's energy over its start, priced wear added, of each of scenarios (n, ...), (n,)."""
+
+    def one(scenario):
+        log = simulate(SYSTEM, *informed(params, scenario), KEY, ticks=round(SECONDS / DT))
+        square = log.w @ log.w
+        return jnp.sum(square) * DT / square[0] + WEAR * SECONDS * jnp.mean(log.acceleration)
+
+    return jax.vmap(one)(scenarios)
 
 
 BEFORE = {
@@ -294,8 +304,8 @@ def verdict_score(params, scenario, now, log):
 def judged(design, h) -> dict:
     """Classes, costs and so on of a design on held-out momenta."""
     params, shift = design
-    scenarios = jax.tree.map(np.asarray, days(h, shift))
-    got, rate, acceleration = sweep(SYSTEM, params, scenarios, KEY, ticks=6001, score=verdict_score)
+    pairs = jax.vmap(lambda scenario: informed(params, scenario))(days(h, shift))
+    got, rate, acceleration = sweep(varied(SYSTEM), (), pairs, KEY, ticks=6001, score=varied(verdict_score))
     cost = SECONDS * (rate + WEAR * acceleration)
     return dict(
         cost=cost, rate=SECONDS * rate, wear=got.variation, settling=got.settling, **{"class": cmg.classify(got)}
@@ -307,14 +317,15 @@ def tuned_figure(report, runs: dict, n: int) -> None:
     for ax, (structure, part) in zip(axes, (("pyramid", slice(0, n)), ("box-90", slice(n, None)))):
         for x, name in enumerate(runs):
             cls, bottom = runs[name]["class"][part], 0.0
-            for k, (label, colour) in enumerate(
-                zip(("proper", "lock", "fluctuation"), (COLOURS[2], "#F0E442", COLOURS[1]))
-            ):
+            for k, (label, colour, hatch) in enumerate(LOOKS):
                 share = np.mean(cls == k)
-                ax.bar(x, share, bottom=bottom, color=colour, edgecolor="0.3", lw=0.5, label=label if x == 0 else None)
+                look = dict(color=colour, hatch=hatch, edgecolor="white")
+                ax.bar(x, share, bottom=bottom, label=label if x == 0 else None, **look)
                 bottom += share
-        ax.set_xticks(range(len(runs)), [name.replace(", ", ",\n") for name in runs], fontsize=8)
+        ax.set_xticks(
+            range(len(runs)), [name.replace(", ", ",\n").replace("K_I", "$K_I$") for name in runs], fontsize=8
+        )
         ax.set_title(f"{structure} {list(BASES[structure])} deg, {n} held-out momenta", fontsize=10)
-    axes[0].set_ylabel("share of runs")
+    axes[0].set_ylabel("share of runs [1]")
     fig.legend(*axes[1].get_legend_handles_labels(), loc="outside upper center", ncols=3)
     report.figure("classes_before_after", fig)

@@ -20,6 +20,7 @@ import numpy as np
 
 from experiments.report import plt
 from jaxatt import check
+from jaxatt.plot import COLOURS, LINES
 
 # before and after on the same scenarios
 
@@ -314,19 +315,17 @@ def cpu_ratio(dear: Callable, cheap: Callable, *operands) -> float:
 
 # the figure
 
-STYLES = {  # colour-blind safe, and told apart in grey by the dashes
-    "gradient": ("#0072B2", "-"),
-    "random search": ("#777777", ":"),
-    "CMA-ES": ("#D55E00", "--"),
-    "Nelder-Mead": ("#009E73", "-."),
-}
+METHODS = ["gradient", "CMA-ES", "Nelder-Mead", "random search"]
+STYLES = dict(zip(METHODS, zip(COLOURS, LINES)))
 
 
 def budget_figure(traces: dict[str, list[Trace]], budget: float, unit: str, title: str = ""):
     """Lowest cost so far against simulations spent, and how far it is above the lowest that any search found.
 
-    Median and range over the traces of each method. traces: for each method of `STYLES` its traces over seeds, that
-    of the gradient first; unit: of the cost, for the axis.
+    Median and range over the traces of each method.
+
+    traces: for each method of `STYLES` its traces over seeds, that of the gradient first; unit: of the cost, for the
+    axis; title: of the figure.
     """
     fig, (left, right) = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
     spent = np.unique(np.round(np.geomspace(1, budget, 400)))

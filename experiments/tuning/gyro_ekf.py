@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from experiments.gyro_ekf import COLOURS, SUBSETS, mask
+from experiments.gyro_ekf import SIX_LOOKS, SUBSETS, mask
 from experiments.report import plt
 from experiments.tuning.compare import (
     contest,
@@ -31,15 +31,15 @@ from experiments.tuning.compare import (
     told,
 )
 from jaxatt import scores, simulate, sweep, tune
-from jaxatt.engine import Now
+from jaxatt.contract import Now
+from jaxatt.faults import dead_where
 from jaxatt.linear import growth_rates, sampled
-from jaxatt.mounting import total
-from jaxatt.objectives import growth_rate, penalty
-from jaxatt.study import batch
-from jaxatt.systems import gyro_ekf
-from jaxatt.systems.gyro_ekf import CONTROL, DEG, DT, INERTIA, Params, Scenario, direct, failed, params
+from jaxatt.loops import gyro_ekf
+from jaxatt.loops.gyro_ekf import CONTROL, DEG, DT, INERTIA, Params, Scenario, direct, params
+from jaxatt.plot import COLOURS, GREY
+from jaxatt.soft_scores import growth_rate, penalty
 from jaxatt.tuning import multi_start
-from jaxatt.vec import Mat3, Vec3, array
+from jaxatt.vec import Mat3, Vec3, array, inverse, largest, resultant
 
 NAMES = ("k_p", "k_i", "k_d")
 PERIOD = CONTROL * DT  # [s] between commands
@@ -76,25 +76,22 @@ def scaled(factors) -> Params:
 
 
 @jax.jit
-@partial(jax.vmap, in_axes=(None, -1))
-def linearised(factors, scenario):
-    """The matrix of one period, (9, 9), without filter."""
-    return sampled(direct, scaled(factors), scenario, ticks=CONTROL, states=("integral", "angle", "w"))
+def linearised(factors, J):
+    """The matrix of one period without filter for every subset, (16, 9, 9).
 
-
-def at_rest(J: Mat3) -> Scenario:
-    """A satellite at rest with inertia J, for every subset; a dead gyro reads zero."""
-    none = np.zeros(4)
-    still = Scenario(w=Vec3(0.0, 0.0, 0.0), h=none, bias=none, announced=0.0, J=J)
-    return batch(still, 16)._replace(gyro=failed(mask(*SUBSETS)))
+    Of a satellite at rest with inertia J (3, 3), on which a dead gyro reads zero.
+    """
+    none, states = np.zeros(4), ("x.integral", "x.angle", "x.w")
+    still = Scenario(w=Vec3(0.0, 0.0, 0.0), h=none, bias=none, announced=0.0, J=Mat3.of(J))
+    period = lambda scenario: sampled(direct, scaled(factors), scenario, ticks=CONTROL, states=states)
+    return jax.vmap(lambda dead: period(still._replace(gyro=dead_where(dead))))(mask(*SUBSETS))
 
 
 def loops(coupling: float = 1.0) -> Loops:
     """Of a satellite at rest whose J_xy, J_xz and J_yz are so many times the paper's."""
     J = np.where(np.eye(3) > 0, 1.0, coupling) * np.array([[*row] for row in INERTIA])
-    here = at_rest(Mat3(*(Vec3(*row) for row in J)))
-    still = np.asarray(linearised(np.zeros(9), here))
-    return Loops(still, np.stack([np.asarray(linearised(unit, here)) for unit in np.eye(9)]) - still)
+    still = np.asarray(linearised(np.zeros(9), J))
+    return Loops(still, np.stack([np.asarray(linearised(unit, J)) for unit in np.eye(9)]) - still)
 
 
 def matrix(loops: Loops, log_factors, subsets):
@@ -145,7 +142,7 @@ def without_filter(report) -> None:
     """Part 1."""
     nominal = loops()
     paper = growth(nominal, np.zeros(9))
-    anew = growth_rates(linearised(np.full(9, 1.3), at_rest(INERTIA)), PERIOD)[:, 0]
+    anew = growth_rates(linearised(np.full(9, 1.3), np.array(INERTIA)), PERIOD)[:, 0]
     report.check("growth rates by the affine form at 1.3 x gains [1/s]", anew,
                  growth(nominal, np.full(9, np.log(1.3))), 1e-9, "the loop linearised there")  # fmt: skip
 
@@ -173,7 +170,7 @@ def simulated(report, theta) -> None:
     report.note(f"no filter, {n} held-out initial states for each subset, 2000 s: largest |angle| at the end [deg]")
     ends = []
     for factors in (np.ones(9), np.exp(theta)):
-        got = sweep(direct, scaled(factors), days, jax.random.key(VERDICT), ticks=16001, score=gyro_ekf.score_loop)
+        got = sweep(direct, scaled(factors), days, jax.random.key(VERDICT), ticks=16001, score=gyro_ekf.score)
         ends.append(np.where(got.ok, got.final_error / DEG, np.inf).reshape(16, n))
     for s, before, after in zip(SUBSETS, *ends):
         report.note(f"{s or 'none':8} paper's gains {before.max():10.3g}, tuned {after.max():10.3g}")
@@ -219,7 +216,7 @@ def growth_figure(report, paper, tuned, history) -> None:
     ax.bar(place - 0.2, 1e3 * paper, 0.4, color=COLOURS[0], label="paper's gains")
     ax.bar(place + 0.2, 1e3 * tuned, 0.4, color=COLOURS[1], label="tuned, one set for all")
     ax.axhline(0, color="k", lw=0.8)
-    ax.axhline(-2, color="0.4", lw=0.8, ls="--")
+    ax.axhline(-2, color=GREY, lw=0.8, ls="--")
     ax.set_xticks(place, [s or "none" for s in SUBSETS])
     ax.set(xlabel="dead gyros", ylabel="growth rate [1e-3 / s]", title="without the filter: positive rates diverge")
     ax.legend()
@@ -232,17 +229,16 @@ def growth_figure(report, paper, tuned, history) -> None:
 def drawn(seed: int, subsets, n: int) -> Scenario:
     """Every subset of dead gyros, by number, with the same n random initial states, wheel momenta and biases.
 
-    They have the size of Table 6's; shape (len(subsets) * n), subset by subset.
+    They have the size of Table 6's; len(subsets) * n scenarios, subset by subset.
     """
     rng, m = np.random.default_rng([seed, 7]), len(subsets)
-    normal = lambda *shape: np.tile(rng.normal(size=(*shape, n)), m)
-    return batch(Scenario(), m * n)._replace(
-        angle=Vec3(*(0.03 * DEG * normal(3))),
-        w=Vec3(*(0.02 * DEG * normal(3))),
-        h=10.0 * normal(4),
-        bias=0.02 * DEG * normal(4),
-        gyro=failed(np.repeat(mask(*(SUBSETS[i] for i in subsets)), n, axis=1)),
-    )
+    normal = lambda k: np.tile(rng.normal(size=(k, n)), m).T
+    dead = np.repeat(mask(*(SUBSETS[i] for i in subsets)), n, axis=0)
+
+    def day(angle, w, h, bias, dead):
+        return Scenario(angle=Vec3.of(angle), w=Vec3.of(w), h=h, bias=bias, gyro=dead_where(dead))
+
+    return jax.vmap(day)(0.03 * DEG * normal(3), 0.02 * DEG * normal(3), 10.0 * normal(4), 0.02 * DEG * normal(4), dead)
 
 
 # with the filter: PID gains
@@ -255,10 +251,10 @@ NORMALS = gyro_ekf.system.normals
 
 
 class Trial(NamedTuple):
-    """A scenario, and the gains that fly in it, so that candidates lie in lanes beside each other."""
+    """A scenario, and the gains that fly in it, so that candidates fly side by side."""
 
-    gains: Any  # (6, *lanes) [1] logarithms of factors on the paper's K_P x, y, z, K_D x, y, z
-    unrest: Any  # () 1: random torques on the body and friction of the wheels, 0: none
+    gains: Any  # (6,) [1] logarithms of factors on the paper's K_P x, y, z, K_D x, y, z
+    unrest: Any  # 1: random torques on the body and friction of the wheels, 0: none
     day: Scenario
 
 
@@ -273,7 +269,7 @@ class Flight(NamedTuple):
 
 
 def pid(log_factors) -> Params:
-    """Gains times exp(log_factors (6, *lanes)), K_I in step with K_P.
+    """Gains times exp(log_factors (6,)), K_I in step with K_P.
 
     The integral time K_P / K_I stays the paper's: with no lasting torque in the scenarios a search would switch the
     integral off.
@@ -287,11 +283,12 @@ def restless_tick(params: Params, trial: Trial, now, x, z, noise):
     """A tick of the loop with filter; random torques kick the body, random friction the wheels."""
     own = pid(trial.gains)
     kick = trial.unrest * STD_WHEEL * noise[NORMALS + 3 :]
-    push = trial.unrest * STD_TORQUE * Vec3(*noise[NORMALS : NORMALS + 3]) - z.J_inv @ total(z.wheels, kick)
+    push = trial.unrest * STD_TORQUE * Vec3.of(noise[NORMALS : NORMALS + 3])
+    push = push - inverse(trial.day.J) @ resultant(z.wheels, kick)
     x = x._replace(w=x.w + push, h=x.h + kick)
     aboard = params._replace(k_p=own.k_p, k_i=own.k_i, k_d=own.k_d)
     x, z, log = gyro_ekf.tick(aboard, trial.day, now, x, z, noise[:NORMALS])
-    return x, z, Flight(log.angle, log.w, total(z.wheels, log.u), log.u, z.readings)
+    return x, z, Flight(log.angle, log.w, -resultant(z.wheels, log.u), log.u, z.readings)
 
 
 restless = gyro_ekf.system._replace(
@@ -305,20 +302,19 @@ restless = gyro_ekf.system._replace(
 
 def trials(log_factors, days: Scenario, unrest=0.0) -> Trial:
     """Every day under gains of log_factors (6,)."""
-    n = days.fill.shape[-1]
-    return Trial(jnp.broadcast_to(jnp.asarray(log_factors)[:, None], (6, n)), np.full(n, unrest), days)
+    return jax.vmap(lambda day: Trial(log_factors, unrest, day))(days)
 
 
 def flights(params: Params, trials: Trial, seed: int) -> Flight:
-    """Their logs, (TICKS, ..., n)."""
-    keys = jax.random.split(jax.random.key(seed), trials.unrest.shape[-1])
-    return simulate(restless, params, trials, keys, ticks=TICKS)
+    """Their logs, (n, TICKS, ...)."""
+    keys = jax.random.split(jax.random.key(seed), len(trials.unrest))
+    return jax.vmap(lambda trial, key: simulate(restless, params, trial, key, ticks=TICKS))(trials, keys)
 
 
 def pid_costs(log_factors, days: Scenario, seed: int):
     """Mean square of angle and priced torque of every day, (n,) [rad^2]."""
-    log = flights(params, trials(log_factors, days), seed)
-    return jnp.mean(log.angle @ log.angle + PRICE * (log.torque @ log.torque), axis=0)
+    log = flights(params, trials(jnp.asarray(log_factors), days), seed)
+    return jnp.mean(log.angle @ log.angle + PRICE * (log.torque @ log.torque), axis=1)
 
 
 def pid_score(params, trial: Trial, now, log: Flight):
@@ -328,11 +324,11 @@ def pid_score(params, trial: Trial, now, log: Flight):
     return dict(
         cost=scores.mean(size + PRICE * torque, early),
         angle=scores.rms(size, early),
-        peak=scores.peak(gyro_ekf.worst(log.angle)),
-        settling=scores.settling(now, ~(gyro_ekf.worst(log.angle) <= gyro_ekf.BAND)),
+        peak=scores.peak(largest(log.angle)),
+        settling=scores.settling(now, ~(largest(log.angle) <= gyro_ekf.BAND)),
         late=scores.rms(size, late),
         torque=scores.rms(torque, early),
-        peak_torque=scores.peak(gyro_ekf.worst(log.torque)),
+        peak_torque=scores.peak(largest(log.torque)),
         late_torque=scores.rms(torque, late),
     )
 
@@ -422,6 +418,7 @@ def pid_figure(report, before, after) -> None:
 
 TRUE_STD = dict(std_angle=3e-4, std_gyro=4e-6, std_tacho=3e-4)  # [rad], [rad/s], [in-lbf-s]; Table 5: 1e-4, 1e-6, 1e-4
 LEVELS = ("R angle", "R gyro", "R tacho", "Q angle", "Q rate", "Q wheel")
+UNITS = ("rad^2", "rad^2/s^2", "in-lbf^2 s^2", "rad^2/s", "rad^2/s^3", "in-lbf^2 s")
 TRUE = np.array([9e-8, 1.6e-11, 9e-8, np.nan, STD_TORQUE**2 / DT, STD_WHEEL**2 / DT])  # Q angle: none
 PRINTED = np.array([1.0, 1e-2, 1.0, 1e-10, 1e-10, 1e-8])  # Table 5
 FROM = 160  # [ticks] before, the innovations are those of the start
@@ -442,36 +439,34 @@ def recorded(seed: int, n: int) -> Flight:
 
 
 def replayed(aboard: Params, log: Flight):
-    """On-board code on recorded readings: negative log-likelihood, NIS, rows, errors of angles and rates.
+    """On-board code on the readings of one flight: (nll, nis, rows) of each update, errors of angles and rates (ticks, 6).
 
-    Shapes (ticks, lanes) and, of the errors, (ticks, 3, lanes). The recorded command is the one the wheels followed.
+    The recorded command is the one the wheels followed.
     """
-    n = log.u.shape[-1]
-    _, z = jax.vmap(gyro_ekf.init, in_axes=(None, -1), out_axes=-1)(aboard, batch(Scenario(), n))
+    _, z = gyro_ekf.init(aboard, Scenario())
 
-    def tick(board, now_and_log):
+    def tick(computer, now_and_log):
         k, y, u = now_and_log
-        board, (met, _) = gyro_ekf.decide(aboard, Now(k, k * DT, DT), board, y)
-        return board._replace(u=u), (met, board.belief.mean[3:9])
+        computer, (met, _) = gyro_ekf.decide(aboard, Now(k, k * DT, DT), computer, y)
+        return computer._replace(u=u), ((met.nll, met.nis, met.rows), computer.belief.mean[3:9])
 
-    ticks = log.u.shape[0]
-    _, (met, mean) = jax.lax.scan(jax.checkpoint(tick), z.board, (jnp.arange(ticks), log.readings, log.u))
-    truth = jnp.concatenate([jnp.moveaxis(array(a), 0, 1) for a in (log.angle, log.w)], axis=1)
-    return met, truth - mean
+    _, (met, mean) = jax.lax.scan(jax.checkpoint(tick), z.computer, (jnp.arange(len(log.u)), log.readings, log.u))
+    return met, jnp.concatenate([array(log.angle), array(log.w)]).T - mean
 
 
 @jax.jit
-def honesty(aboard: Params, log: Flight):
-    """Negative log-likelihood and NIS for each measurement, rms errors of angle [rad] and rate [rad/s]; (lanes,)."""
-    met, error = replayed(aboard, log)
-    rows = jnp.sum(met.rows[FROM:], axis=0)
-    rms = lambda part: jnp.sqrt(jnp.mean(jnp.sum(error[FROM:, part] ** 2, axis=1), axis=0))
-    return dict(
-        nll=jnp.sum(met.nll[FROM:], axis=0) / rows,
-        nis=jnp.sum(met.nis[FROM:], axis=0) / rows,
-        angle=rms(slice(0, 3)),
-        w=rms(slice(3, 6)),
-    )
+def honesty(aboard: Params, logs: Flight):
+    """Negative log-likelihood and NIS for each measurement, rms errors of angle [rad] and rate [rad/s]; each (n,)."""
+
+    def one(log):
+        (nll, nis, rows), error = replayed(aboard, log)
+        rows = jnp.sum(rows[FROM:])
+        rms = lambda part: jnp.sqrt(jnp.mean(jnp.sum(error[FROM:, part] ** 2, axis=1)))
+        return dict(
+            nll=jnp.sum(nll[FROM:]) / rows, nis=jnp.sum(nis[FROM:]) / rows, angle=rms(slice(0, 3)), w=rms(slice(3, 6))
+        )
+
+    return jax.vmap(one)(logs)
 
 
 def noise_levels(report) -> None:
@@ -533,16 +528,17 @@ def noise_levels(report) -> None:
 
 def levels_figure(report, history, before, after) -> None:
     fig, (left, right) = plt.subplots(1, 2, figsize=(10, 3.8), layout="constrained")
-    for name, line, level, colour, dash in zip(LEVELS, history.theta.T / np.log(10), TRUE, COLOURS, ("-", "--") * 3):
-        left.plot(line, color=colour, ls=dash, label=name)
+    for name, unit, line, level, look in zip(LEVELS, UNITS, history.theta.T / np.log(10), TRUE, SIX_LOOKS):
+        left.plot(line, label=f"{name} [{unit}]", **look)
         if np.isfinite(level):
-            left.plot(len(line) - 1, np.log10(level), "o", color=colour, mfc="none")
-    left.set(xlabel="step of the search", ylabel="log10 of the level", title="circles: the true levels")
+            left.plot(len(line) - 1, np.log10(level), "o", color=look["color"], mfc="none")
+    left.set(xlabel="step of the search [1]", title="circles: the true levels")
+    left.set(ylabel="log10 of the level [units of the legend]", ylim=(None, -1))
     left.legend(ncols=2, fontsize=8)
     top = 1e3 * max(before["angle"].max(), after["angle"].max()) / DEG
     bins = np.linspace(0, top, 40)
     for values, colour, name in ((before, COLOURS[0], "Table 5"), (after, COLOURS[1], "tuned")):
         right.hist(1e3 * values["angle"] / DEG, bins, color=colour, alpha=0.7, label=name)
-    right.set(xlabel="rms error of the estimated angles [1e-3 deg]", ylabel="held-out flights")
+    right.set(xlabel="rms error of the estimated angles [1e-3 deg]", ylabel="held-out flights [1]")
     right.legend()
     report.figure("noise_levels", fig)

@@ -17,13 +17,14 @@ from jax.flatten_util import ravel_pytree
 from experiments.observer_pd import FINE, QUIET, last_outside
 from experiments.report import interval, plt
 from experiments.tuning import compare
-from jaxatt import Fault, Vec3, objectives, on_axes, scores, simulate, sweep
-from jaxatt.engine import compiled
-from jaxatt.objectives import penalty, weighted
-from jaxatt.study import batch, varied
-from jaxatt.systems import observer_pd as op
+from jaxatt import Fault, Vec3, on_axes, scores, simulate, soft_scores, sweep, varied
+from jaxatt.compiling import compiled
+from jaxatt.controllers import pd_margins
+from jaxatt.loops import observer_pd as op
+from jaxatt.plot import COLOURS, GREY, LINES
+from jaxatt.soft_scores import penalty, weighted
 from jaxatt.tuning import best_of, bounded, multi_start, tune, value_and_gradient, worst_case
-from jaxatt.vec import norm
+from jaxatt.vec import norm, zeros
 
 TICKS = 400  # 40 s: a slew, a gyro fault that grows from 15-20 s on, a star-sensor fault from 30-35 s on
 QUIET_FROM = 5.0  # [s] from here to the onset an alarm is a false one; the observer converges meanwhile
@@ -80,15 +81,16 @@ def drawn(key, n: int) -> op.Scenario:
     q = axis * (jnp.tan(uniform(60.0, 150.0) * jnp.pi / 180 / 4) / norm(axis))
     w = normal(0.5)
     way = normal(1.0)
-    bias = way * (uniform(0.01, 0.06) / norm(way))
+    drift = way * (uniform(0.01, 0.06) / norm(way))
     onset, tau = uniform(15.0, 20.0), uniform(0.5, 5.0)
-    star_onset, star_size = uniform(30.0, 35.0), uniform(0.003, 0.02)
-    one = batch(Fault(), n)
-    return batch(op.scenario, n)._replace(
-        q=q, w=w, q_hat=q + normal(0.05), w_hat=w + normal(0.05),
-        gyro=Vec3(*(one._replace(onset=onset, drift=b, tau=tau) for b in bias)),
-        star=on_axes(one._replace(onset=star_onset, random=star_size)),
-    )  # fmt: skip
+    star = dict(onset=uniform(30.0, 35.0), random=uniform(0.003, 0.02))
+    q_hat, w_hat = q + normal(0.05), w + normal(0.05)
+
+    def day(q, w, q_hat, w_hat, drift, onset, tau, star):
+        gyro = Vec3(*(Fault(onset, drift=d, tau=tau) for d in drift))
+        return op.scenario._replace(q=q, w=w, q_hat=q_hat, w_hat=w_hat, gyro=gyro, star=on_axes(Fault(**star)))
+
+    return jax.vmap(day)(q, w, q_hat, w_hat, drift, onset, tau, star)
 
 
 def slew_first(scenarios: op.Scenario, key):
@@ -113,12 +115,12 @@ def score(params: op.Params, scenario: op.Scenario, now, log: op.Log) -> dict:
     before = now.t < onset
     quiet = before & (now.t >= QUIET_FROM)
     q = norm(log.e_q)
-    soft = objectives.detection(
-        now, objectives.soft_alarm(log.xi, params.sigma, TEMPERATURE * params.sigma), onset, QUIET_FROM
+    soft = soft_scores.detection(
+        now, soft_scores.soft_alarm(log.xi, params.sigma, TEMPERATURE * params.sigma), onset, QUIET_FROM
     )
     return dict(
-        post_q=real.rms_q_ill,  # [1] true attitude error after the first onset, rms of a run
-        post_u=real.rms_u_ill,  # [N m]
+        post_q=real.rms_q_faulty,  # [1] true attitude error after the first onset, rms of a run
+        post_u=real.rms_u_faulty,  # [N m]
         rms_u=real.rms_u,  # [N m] whole run
         peak_u=real.peak_u,  # [N m]
         transient=scores.mean(q, before),  # [1] attitude error of the slew
@@ -126,7 +128,7 @@ def score(params: op.Params, scenario: op.Scenario, now, log: op.Log) -> dict:
         delay=real.delay,  # [s]
         miss=real.miss,  # [1]
         false_alarms=scores.mean(log.alarm, quiet),  # [1]
-        soft_settling=objectives.settling(now, objectives.soft_alarm(q, 0.01, 0.001), before),  # [s]
+        soft_settling=soft_scores.soft_settling(now, soft_scores.soft_alarm(q, 0.01, 0.001), before),  # [s]
         soft_delay=soft.delay, soft_miss=soft.miss, soft_false=soft.false_alarms,
         ok=real.ok,
     )  # fmt: skip
@@ -154,7 +156,7 @@ def cost_of(free, key, reference: dict, case):
     gains = BOUNDS.within(free)
     s = scored(gains, *slew_first(drawn(jax.random.fold_in(key, 0), N), jax.random.fold_in(key, 1)))
     t = terms(s, reference)
-    proof = op.margins(op.params._replace(**gains), LAMBDA)
+    proof = pd_margins(gains["k_q"], gains["k_w0"], op.params.eps, LAMBDA)
     held = sum(penalty(t[name] - 0.96) for name in HELD) + penalty(t["post_u"] - case[-1])
     held = held + penalty(1 - proof.k_q) + penalty(0.1 - proof.T)
     return weighted(t, dict(zip(WEIGHTS, case))) + 100 * held
@@ -183,7 +185,7 @@ def search(reference: dict, cases: np.ndarray, steps: int, save):
 
 # fronts: what the tuned points are worth among others
 
-BLUE, ORANGE, GREEN, PINK = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
+BLUE, ORANGE, GREEN, PINK = COLOURS  # watchful, the paper's, balanced, picked by hand, in all figures
 
 
 def hard(s: dict, scenarios: op.Scenario) -> dict:
@@ -211,18 +213,20 @@ def each_judged(gains: dict, n: int) -> dict:
     """Mean scores of many sets of gains, leaves of shape (sets,), each on the same n scenarios of CHOICE: a sweep."""
     sets = len(gains["alpha"])
     scenarios, key = days(CHOICE, n)
+    pair = lambda gains, scenario: (op.params._replace(**gains), scenario)
     repeated = jax.tree.map(lambda a: np.tile(a, sets), scenarios)
-    spread = lambda a: np.full(n * sets, a)
-    params = jax.tree.map(spread, op.params)._replace(**{name: np.repeat(v, n) for name, v in gains.items()})
-    swept = sweep(
-        varied(op.system), (), (params, repeated), key, ticks=TICKS, score=lambda _, pair, *a: score(*pair, *a)
-    )
+    pairs = jax.vmap(pair)({name: np.repeat(values, n) for name, values in gains.items()}, repeated)
+    swept = sweep(varied(op.system), (), pairs, key, ticks=TICKS, score=varied(score))
     judged = hard(swept, repeated) | dict(ok=swept["ok"])
     # the paper's own slew, on a finer grid of ticks
-    settling = lambda _, pair, now, log: scores.settling(now, norm(log.e_q) > 0.01)
-    pairs = batch(op.params, sets)._replace(**gains), batch(QUIET, sets)
-    slew = sweep(varied(FINE._replace(dt=0.02)), (), pairs, key, ticks=600, score=settling)
+    pairs = jax.vmap(lambda gains: pair(gains, QUIET))(gains)
+    slew = sweep(varied(FINE._replace(dt=0.02)), (), pairs, key, ticks=600, score=varied(slew_score))
     return {name: np.mean(a.reshape(sets, n), axis=1) for name, a in judged.items()} | dict(slew=slew)
+
+
+def slew_score(params: op.Params, scenario: op.Scenario, now, log: op.Log):
+    """The settling time [s] of a run."""
+    return scores.settling(now, norm(log.e_q) > 0.01)
 
 
 def fronts(report, reference: dict, found: list[dict]) -> dict:
@@ -253,11 +257,11 @@ def fronts(report, reference: dict, found: list[dict]) -> dict:
                   "error, torque; random, by hand")  # fmt: skip
     report.within("sets that dominate watchful", None, 0, better(watchful, detection, [*range(sets), sets, sets + 1]),
                   "delay, false alarms; random, by hand")  # fmt: skip
-    fig, axes = plt.subplots(1, 2, figsize=(11, 4.6), layout="constrained")
+    fig, axes = plt.subplots(1, 2, figsize=(11, 5.2), layout="constrained")
     first = sets + 2 + len(TUNED)
     lines = {tracking: range(first, len(price))[: len(TRACKING)], detection: range(first, len(price))[len(TRACKING) :]}
     labels = {
-        "post_q": "rms attitude error after the fault [MRP]",
+        "post_q": "rms attitude error after the fault, MRP [1]",
         "post_u": "rms torque after the fault [N m]",
         "delay": "mean detection delay, never = to the end [s]",
         "false_alarms": "share of false alarms, 5 s to the fault [1]",
@@ -277,19 +281,19 @@ def fronts(report, reference: dict, found: list[dict]) -> dict:
             show(front),
             "o-" if y == "post_u" else "o",
             ms=5,
-            color=BLUE,
+            color=GREEN,
             label="tuned, weights varied",
         )
         for i, marker, colour, name in (
             (sets, "s", ORANGE, "the paper's"), (sets + 1, "D", PINK, "picked by hand"), (best, "v", "k", "best random"),
-            (balanced, "*", GREEN, "balanced"), (watchful, "P", GREEN, "watchful"),
+            (balanced, "*", GREEN, "balanced"), (watchful, "P", BLUE, "watchful"),
         ):  # fmt: skip
             ax.scatter(judged[x][i], show(i), s=130 if marker in "*P" else 60, marker=marker, color=colour,
                        edgecolor="w", zorder=3, label=name)  # fmt: skip
         ax.set(xlabel=labels[x], ylabel=labels[y], xscale="log", yscale="log")
         ax.grid(alpha=0.3)
     axes[1].set_ylabel(f"{labels['false_alarms']}, none = {floor:g}")
-    axes[0].legend(fontsize=8)
+    fig.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8)
     report.figure("fronts", fig)
     return {name: float(values[best]) for name, values in drawn_gains.items()}
 
@@ -348,17 +352,16 @@ def verdict(report, reference: dict, found: list[dict], best_random: dict) -> No
 def way(report, history) -> None:
     """Cost and gains of the balanced point, step by step."""
     fig, (left, right) = plt.subplots(1, 2, figsize=(9, 3.5), layout="constrained")
-    for i, (label, colour) in enumerate(zip(TUNED, (BLUE, ORANGE))):
-        left.plot(history.cost[:, i], color=colour, ls=("-", "--")[i], label=label)
-    left.set(xlabel="step of the search", ylabel="cost on the validation scenarios", yscale="log")
+    for i, (label, colour) in enumerate(zip(TUNED, (GREEN, BLUE))):
+        left.plot(history.cost[:, i], color=colour, ls=LINES[i], label=label)
+    left.set(xlabel="step of the search", ylabel="cost on the validation scenarios [1]", yscale="log")
     left.legend()
     gains = BOUNDS.within(history.theta["free"])
-    styles = zip(PAPER, (r"$\alpha$", r"$\beta$", r"$\sigma$", "$k_q$", "$k_{w0}$"),
-                 (BLUE, ORANGE, GREEN, PINK, "k"), ("-", "--", "-.", ":", (0, (5, 1))))  # fmt: skip
-    for name, label, colour, dashes in styles:
-        right.plot(gains[name][:, 0] / PAPER[name], color=colour, ls=dashes, label=label)
-    right.set(xlabel="step of the search, balanced", ylabel="gain / the paper's", yscale="log")
-    right.legend(ncols=2, loc="center right")
+    styles = zip(PAPER, (r"$\alpha$", r"$\beta$", r"$\sigma$", "$k_q$", "$k_{w0}$"), (*LINES, (0, (3, 1, 1, 1, 1, 1))))
+    for name, label, dashes in styles:
+        right.plot(gains[name][:, 0] / PAPER[name], color=GREEN, ls=dashes, label=label)
+    right.set(xlabel="step of the search, balanced", ylabel="gain / the paper's [1]", yscale="log")
+    right.legend(loc="upper left", bbox_to_anchor=(1, 1))
     report.figure("way", fig)
 
 
@@ -380,15 +383,12 @@ def budget(report, reference: dict) -> None:
 
 # the scenario as the unknown
 
-REST = QUIET._replace(
-    q=Vec3(0.0, 0.0, 0.0), w=Vec3(0.0, 0.0, 0.0), q_hat=Vec3(0.0, 0.0, 0.0), w_hat=Vec3(0.0, 0.0, 0.0)
-)
-BIASED = jax.tree.map(float, Fault(onset=1.0, tau=5.0))
+REST = QUIET._replace(q=zeros(), w=zeros(), q_hat=zeros(), w_hat=zeros())
 
 
 def growing(gyro, star) -> op.Scenario:
     """A body at rest on whose sensors offsets grow from 1 s on, with 5 s as time constant; gyro, star: (3,)."""
-    faulty = lambda sizes: Vec3(*(BIASED._replace(drift=size) for size in sizes))
+    faulty = lambda sizes: Vec3(*(Fault(1.0, drift=size, tau=5.0) for size in sizes))
     return REST._replace(gyro=faulty(gyro), star=faulty(star))
 
 
@@ -401,10 +401,12 @@ def worst(report, balanced: dict) -> None:
     """Faults found by gradient: the one that errs most without an alarm, and the onset that hurts a slew most."""
     steps = 30 if report.quick else 80
     quiet = jnp.zeros((250, 6))
-    fig, (left, right) = plt.subplots(1, 2, figsize=(10, 3.8), layout="constrained")
+    fig, panels = plt.subplot_mosaic(
+        [["error", "onset"], ["residual", "onset"]], figsize=(10, 4.4), layout="constrained"
+    )
     box = {"gyro": np.full(3, 0.1), "star": np.full(3, 0.1)}
     silent = {}
-    for label, gains, colour in (("paper's", PAPER, ORANGE), ("balanced", balanced, BLUE)):
+    for label, gains, colour, line in (("paper's", PAPER, ORANGE, "-"), ("balanced", balanced, GREEN, "--")):
         params = op.params._replace(**gains)
 
         def harm(fault, key, params=params):
@@ -434,14 +436,12 @@ def worst(report, balanced: dict) -> None:
         )
         report.within(f"{label}: no alarm at its worst silent fault, peak |xi| / sigma", None, 1,
                       float(jnp.max(log.xi)) / gains["sigma"], "silent")  # fmt: skip
-        t = op.DT * np.arange(250)
-        left.plot(t, degrees(np.asarray(norm(log.e_q))), color=colour, label=f"{label} gains: error")
-        left.plot(t, 10 * np.asarray(log.xi) / gains["sigma"], color=colour, ls=":",
-                  label=f"{label} gains: residual, threshold = 10")  # fmt: skip
-    left.axhline(10, color="0.5", lw=0.8)
-    left.set(xlabel="time [s], faults grow from 1 s on", ylabel="attitude error [deg]; 10 residual / threshold",
-             title="the fault that errs most without alarm")  # fmt: skip
-    left.legend(fontsize=8)
+        panels["error"].plot(log.t, degrees(np.asarray(norm(log.e_q))), color=colour, ls=line, label=f"{label} gains")
+        panels["residual"].plot(log.t, np.asarray(log.xi) / gains["sigma"], color=colour, ls=line)
+    panels["error"].set(title="the fault that errs most without alarm", ylabel="attitude error [deg]")
+    panels["error"].legend(fontsize=8)
+    panels["residual"].axhline(1, color=GREY, lw=0.8)
+    panels["residual"].set(xlabel="time [s], faults grow from 1 s on", ylabel="residual / threshold [1]")
     report.within("worst silent error, balanced / paper's gains", None, 1, silent["balanced"] / silent["paper's"],
                   "by gradient in the fault")  # fmt: skip
 
@@ -452,7 +452,7 @@ def worst(report, balanced: dict) -> None:
     def lateness(fault, key):
         way = Vec3(*fault["way"])
         drift = (0.05 / norm(way)) * way
-        gyro = Vec3(*(Fault()._replace(onset=fault["onset"], drift=d, tau=0.5) for d in drift))
+        gyro = Vec3(*(Fault(fault["onset"], drift=d, tau=0.5) for d in drift))
         log = simulate(op.system, params, QUIET._replace(gyro=gyro), noise, ticks=ticks)
         return 100 * jnp.sqrt(jnp.mean((norm(log.e_q) - healthy)[80:] ** 2))
 
@@ -460,12 +460,13 @@ def worst(report, balanced: dict) -> None:
     fault, history = worst_case(lateness, low, high, optax.adam(0.15), steps, TUNING, starts=8)
     grid = np.linspace(0.15, 11.9, 48)
     along = jax.jit(jax.vmap(lambda onset: lateness(dict(onset=onset, way=fault["way"]), TUNING)))(jnp.asarray(grid))
-    right.plot(grid, along, color="0.4", label="that direction, every onset")
-    right.scatter(history.theta["onset"][-1], history.cost[-1], color=BLUE, zorder=3, label="ends of 8 ascents")
-    right.scatter(fault["onset"], history.cost.max(), s=120, marker="*", color=GREEN, zorder=4, label="worst found")
-    right.set(xlabel="onset of a gyro fault of 0.05 rad/s [s]", ylabel="rms added error, 8-15 s [0.01 MRP]",
-              title="the onset that hurts a slew most")  # fmt: skip
-    right.legend(fontsize=8)
+    onsets = panels["onset"]
+    onsets.plot(grid, along, color=ORANGE, label="that direction, every onset")
+    onsets.scatter(history.theta["onset"][-1], history.cost[-1], color=GREY, zorder=3, label="ends of 8 ascents")
+    onsets.scatter(fault["onset"], history.cost.max(), s=120, marker="*", color="k", zorder=4, label="worst found")
+    onsets.set(xlabel="onset of a gyro fault of 0.05 rad/s [s]", ylabel="rms added error, 8-15 s, 100 MRP [1]",
+               title="the onset that hurts a slew most, the paper's gains")  # fmt: skip
+    onsets.legend(fontsize=8)
     report.note(
         f"worst onset {float(fault['onset']):.2f} s: {history.cost.max():.3f}, best of the grid {along.max():.3f}"
     )
@@ -490,7 +491,7 @@ def thresholds(report) -> None:
         quiet = before & (now.t >= 3)  # the observer is still converging: false alarms are no rare event
         at = lambda f: (scores.mean(1 - f, ~before), scores.mean(f, quiet))
         hard = [at(log.xi > params.sigma * np.exp(by)) for by in (-change, change)]
-        return hard, [at(objectives.soft_alarm(log.xi, params.sigma, width * params.sigma)) for width in WIDTHS]
+        return hard, [at(soft_scores.soft_alarm(log.xi, params.sigma, width * params.sigma)) for width in WIDTHS]
 
     def run(a, scenarios, key):
         params = op.params._replace(sigma=op.params.sigma * jnp.exp(a))
@@ -510,11 +511,13 @@ def thresholds(report) -> None:
         for width, b in zip(WIDTHS, batches):
             report.note(f"  width {width:4g}: {b.mean():9.4f}, spread {b.std(ddof=1):.4f}")
         ax.axhline(real.mean(), color="k", lw=1, label=f"real share, difference over $\\pm${100 * change:g} %")
-        ax.axhspan(real.mean() - error, real.mean() + error, color="0.85")
+        ax.axhspan(real.mean() - error, real.mean() + error, color="0.85", label="its 95 % interval")
         ax.errorbar(WIDTHS, batches.mean(1), batches.std(1, ddof=1), fmt="o-", color=BLUE, capsize=3,
                     label=f"smooth share, gradient: spread over batches of {group}")  # fmt: skip
         ax.axhline(0, color=ORANGE, ls="--", label="real share, gradient")
-        ax.set(xscale="log", xlabel="width of the smooth alarm [thresholds]", ylabel=f"d ({name}) / d log $\\sigma$")
-        ax.legend(fontsize=8)
+        ax.set(
+            xscale="log", xlabel="width of the smooth alarm [thresholds]", ylabel=f"d ({name}) / d log $\\sigma$ [1]"
+        )
         ax.grid(alpha=0.3)
+    fig.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=8)
     report.figure("thresholds", fig)

@@ -22,11 +22,11 @@ import optax
 from experiments.report import interval, plt
 from experiments.star_isolation import drawn
 from experiments.tuning import compare
-from jaxatt import Fault, Vec3, detection, objectives, scores, simulate, sweep, tune
-from jaxatt.engine import compiled
-from jaxatt.study import batch
-from jaxatt.systems import star_isolation as si
-from jaxatt.systems.star_isolation import DT, LMMSE, PITCH, ROLL
+from jaxatt import Fault, Reading, Vec3, detection, evaluation, plot, scores, simulate, soft_scores, sweep, tune
+from jaxatt.compiling import compiled
+from jaxatt.loops import star_isolation as si
+from jaxatt.loops.star_isolation import DT, PITCH, ROLL
+from jaxatt.star_filters import LMMSE
 from jaxatt.tuning import bounded, gradient_check, value_and_gradient
 
 SETTLED, ONSET, END = 200, 600, 700  # [ticks] of the tuning runs: false alarms count, fault, end
@@ -45,14 +45,13 @@ RULES = {  # window, margin, std_gyro: thresholds known before
 }
 START = RULES["textbook (moment 5, N = 10)"]
 NUMBERS = bounded(tuple(LOW), tuple(HIGH))
-COLOURS = ("#0072B2", "#D55E00", "#009E73")
 
 
 class Recorded(NamedTuple):
     """Runs that were flown once; filters are run on their readings."""
 
-    readings: Any  # of `simulate`, time first
-    q_hat: Any  # (2, n) initial estimates
+    readings: Any  # of `simulate`, leaves (n, END, ...)
+    q_hat: Any  # leaves (n, 2), initial estimates
     faulty: Any  # (n,) the faulty star sensor
 
 
@@ -77,12 +76,12 @@ def world(n: int, seed: int, onset: Any = ONSET * DT):
     size = rng.uniform(2, 5, n) * rng.choice([-1, 1], n) * si.params.std_star / np.sqrt(2)  # on both tangential axes
     own = lambda sensor: np.where(faulty == sensor, size, 0)
     o = np.zeros(n)
-    pair = batch(Fault(), n)._replace(onset=np.broadcast_to(onset, n))
-    pair = jax.tree.map(lambda a: np.broadcast_to(a, (2, n)), pair)
+    pair = Fault(onset=np.reshape(onset, (-1, 1)))
+    pair = jax.tree.map(lambda a: np.broadcast_to(a, (n, 2)), pair)
     star = Vec3(
-        pair._replace(bias=np.stack([o, own(PITCH)])),
-        pair._replace(bias=np.stack([own(ROLL), o])),
-        pair._replace(bias=np.stack([own(ROLL), own(PITCH)])),
+        pair._replace(bias=np.stack([o, own(PITCH)], axis=-1)),
+        pair._replace(bias=np.stack([own(ROLL), o], axis=-1)),
+        pair._replace(bias=np.stack([own(ROLL), own(PITCH)], axis=-1)),
     )
     bias = Vec3(*(STD_BIAS * rng.standard_normal((3, n))))
     return drawn(n, seed)._replace(star=star, bias=bias), faulty
@@ -92,8 +91,8 @@ def recorded(n: int, seed: int) -> Recorded:
     """The readings of n tuning runs."""
     scenarios, faulty = world(n, seed)
     keys = jax.random.split(jax.random.key(seed), n)
-    fly = lambda scenarios, keys: simulate(si.system, si.params, scenarios, keys, ticks=END).readings
-    return Recorded(compiled(fly, 0)(scenarios, keys), scenarios.q_hat, faulty)
+    fly = lambda scenario, key: simulate(si.system, si.params, scenario, key, ticks=END).readings
+    return Recorded(jax.jit(jax.vmap(fly))(scenarios, keys), scenarios.q_hat, faulty)
 
 
 # the surrogate
@@ -105,34 +104,36 @@ def threshold_of(window, margin):
 
 
 def residuals(params, data: Recorded):
-    """r' M^-1 r of both filters at every tick but the first, shape (END - 1, 2, n).
+    """r' M^-1 r of both filters at every tick but the first, shape (END - 1, n, 2).
 
-    The filters alone: `jaxatt.replay.replay` would run the rest of the board too, tangents and all.
+    The filters alone: `jaxatt.replay.replay` would run the rest of the computer too, tangents and all.
     """
 
     def step(carry, told):
         filters, gyro = carry
-        filters, innovation = si.advanced(LMMSE, params, filters, gyro, told.stars, DT)
+        filters, innovation = si.advanced(LMMSE, params, filters, gyro, Reading(told.stars, np.ones(2, bool)), DT)
         return (filters, told.gyro), innovation.nis
 
-    alone = jax.vmap(partial(LMMSE.start, params))
-    filters = jax.vmap(alone, in_axes=-1, out_axes=-1)(data.q_hat)
-    first, later = (jax.tree.map(lambda a, part=part: a[part], data.readings) for part in (0, slice(1, None)))
-    return jax.lax.scan(step, (filters, first.gyro), later)[1]
+    def one(readings, q_hat):
+        filters = jax.vmap(partial(LMMSE.start, params))(q_hat)
+        first, later = (jax.tree.map(lambda a, part=part: a[part], readings) for part in (0, slice(1, None)))
+        return jax.lax.scan(step, (filters, first.gyro), later)[1]
+
+    return jax.vmap(one, out_axes=1)(data.readings, data.q_hat)
 
 
 def evaluated(numbers, data: Recorded):
-    """J of both filters with a window of real length, shape (END - 1, 2, n)."""
+    """J of both filters with a window of real length, shape (END - 1, n, 2)."""
     window, _, std_gyro = numbers
-    return objectives.soft_windowed(residuals(si.params._replace(std_gyro=std_gyro), data), window, LONGEST)
+    return soft_scores.soft_windowed(residuals(si.params._replace(std_gyro=std_gyro), data), window, LONGEST)
 
 
 def terms_of(p, faulty):
-    """Delay [s] and share of false alarms of every run, shape (n,) each, from alarms p, (END - 1, 2, n), 0 to 1."""
+    """Delay [s] and share of false alarms of every run, shape (n,) each, from alarms p, (END - 1, n, 2), 0 to 1."""
     first = faulty == ROLL
-    own, other = jnp.where(first, p[:, ROLL], p[:, PITCH]), jnp.where(first, p[:, PITCH], p[:, ROLL])
+    own, other = jnp.where(first, p[..., ROLL], p[..., PITCH]), jnp.where(first, p[..., PITCH], p[..., ROLL])
     quiet = jnp.concatenate([own[SETTLED : ONSET - 1], other[SETTLED:]])  # what should be silent
-    return objectives.soft_delay(own[ONSET - 1 :], DT), jnp.mean(quiet, axis=0)
+    return soft_scores.soft_delay(own[ONSET - 1 :], DT), jnp.mean(quiet, axis=0)
 
 
 def cost_of(delay, false):
@@ -143,7 +144,7 @@ def cost_of(delay, false):
 def each_cost(numbers, data: Recorded, temperature=TEMPERATURE, hard: bool = False):
     """Cost [s] of every run, shape (n,); hard: by steps, with no gradient."""
     J, threshold = evaluated(numbers, data), threshold_of(*numbers[:2])
-    p = 1.0 * (threshold < J) if hard else objectives.soft_alarm(J, threshold, temperature)
+    p = 1.0 * (threshold < J) if hard else soft_scores.soft_alarm(J, threshold, temperature)
     return cost_of(*terms_of(p, data.faulty))
 
 
@@ -156,7 +157,7 @@ def by_gradient(report, train: Recorded, steps: int):
     """Adam on the logarithm of the surrogate, numbers within bounds. Returns the history, and its trace."""
     on = lambda data: lambda free, key: jnp.log(tuning_cost(NUMBERS.within(free), data))  # no noise is drawn: no key
     off_the_kinks = NUMBERS.free((9.7, 5.0, 3e-6))  # the surrogate is linear in the window between whole numbers
-    few = jax.tree.map(lambda a: a[..., :32], train)
+    few = jax.tree.map(lambda a: a[:32], train)
     checked = gradient_check(on(few), off_the_kinks, jax.random.key(TUNE))
     report.check("gradient against central difference, relative", 0, checked.relative.max(), 1e-5, "issue: 1e-5")
     optimizer = optax.adam(optax.exponential_decay(0.5, 4, 0.6), b1=0.5, b2=0.9)  # a short memory for a short search
@@ -188,15 +189,15 @@ def hard_score(params, scenario, now, log):
     onset = scenario.star.z.onset[ROLL]
     before, after = (now.t >= SETTLED * DT) & (now.t < onset), (now.t >= onset) & (now.t < onset + WITHIN)
     just_before = (now.t >= onset - WITHIN) & (now.t < onset)
-    alarm, J = log.board.alarm, log.board.J
+    alarm, J = log.verdict.alarm, log.verdict.J
     return dict(
         delay=scores.first(now, alarm & after, since=onset),
         early=scores.first(now, alarm & before),
         rate=scores.mean(alarm, before),
         luck=scores.first(now, alarm & just_before, since=onset - WITHIN),
         healthy=scores.peak(J, just_before),
-        ill=scores.peak(J, after),
-        ok=scores.always(jnp.isfinite(J.sum(axis=0))),
+        faulty=scores.peak(J, after),
+        ok=scores.always(scores.finite(J).all()),
     )
 
 
@@ -214,16 +215,16 @@ def verdict(report, chosen, n: int) -> None:
     scenarios, faulty = world(n, JUDGE, onset)
     rules = {**RULES, "tuned": chosen}
     results = {name: judged(numbers, scenarios) for name, numbers in rules.items()}
-    of = lambda a: np.where(faulty == ROLL, a[ROLL], a[PITCH])
+    of = lambda a: a[np.arange(n), faulty]
     table = {}
     for name, s in results.items():
         delay = of(s["delay"])
-        cause = detection.isolate_first(s["delay"][ROLL], s["delay"][PITCH], PATIENCE)
-        by_luck = detection.isolate_first(s["luck"][ROLL], s["luck"][PITCH], PATIENCE)
+        cause = detection.isolate_first(*s["delay"].T, patience=PATIENCE)
+        by_luck = detection.isolate_first(*s["luck"].T, patience=PATIENCE)
         table[name] = dict(
             miss=~np.isfinite(delay),
             delay=np.minimum(np.where(np.isfinite(delay), delay, np.inf), WITHIN),
-            false=np.isfinite(s["early"]).any(axis=0),
+            false=np.isfinite(s["early"]).any(axis=1),
             right=np.asarray(cause) == faulty + 1,
             lucky=np.isfinite(of(s["luck"])),
             lucky_right=np.asarray(by_luck) == faulty + 1,
@@ -260,24 +261,24 @@ def verdict(report, chosen, n: int) -> None:
 def roc_figure(report, results, faulty) -> None:
     """Detection within 10 s against false alarms within 10 s, over all thresholds of each window and gyro noise."""
     fig, ax = plt.subplots(figsize=(6.5, 4.5), layout="constrained")
-    for (name, s), colour, style in zip(results.items(), COLOURS, ("-", "--", "-.")):
-        of = lambda a: np.where(faulty == ROLL, a[ROLL], a[PITCH])
-        healthy, ill = of(s["healthy"]), of(s["ill"])
-        curve = detection.roc(healthy, ill)
+    for (name, s), colour, style in zip(results.items(), plot.COLOURS, plot.LINES):
+        of = lambda a: a[np.arange(len(faulty)), faulty]
+        healthy, bad = of(s["healthy"]), of(s["faulty"])
+        curve = evaluation.roc(healthy, bad)
         lucky, found = np.isfinite(of(s["luck"])).mean(), np.isfinite(of(s["delay"])).mean()
         least = 0.5 / len(faulty)
         ax.step(np.maximum(curve.false_alarm, least), curve.detection, where="post", color=colour, ls=style, label=name)
         ax.plot(max(lucky, least), found, "o", color=colour, mec="black", ms=8)
         report.note(
-            f"{name}: area under the ROC curve of 10 s windows {detection.area(curve):.4f}; found at false alarms of "
-            f"1e-2 per window {detection.detection_at(healthy, ill, 1e-2):.4f}"
+            f"{name}: area under the ROC curve of 10 s windows {evaluation.area(curve):.4f}; found at false alarms of "
+            f"1e-2 per window {evaluation.detection_at(healthy, bad, 1e-2):.4f}"
         )
     x = np.geomspace(0.5 / len(faulty), 1, 100)
-    ax.plot(x, x, color="#777777", ls=":", label="chance")
+    ax.plot(x, x, color=plot.GREY, ls=":", label="chance")
     ax.set(
         xscale="log",
-        xlabel="share of healthy windows of 10 s with an alarm",
-        ylabel="share of faults found within 10 s",
+        xlabel="share of healthy windows of 10 s with an alarm [1]",
+        ylabel="share of faults found within 10 s [1]",
         title="Dots: the rules as shipped (left edge: no false alarm seen)",
         ylim=(0, 1.02),
     )
@@ -326,12 +327,12 @@ def temperatures(report, train: Recorded) -> None:
         )
     fig, ax = plt.subplots(figsize=(6.5, 4), layout="constrained")
     for values, mark, colour, label in (
-        (gaps, "o-", COLOURS[0], "|surrogate / hard cost - 1|"),
-        (errors, "^-.", COLOURS[2], "|gradient / difference of the hard cost - 1|"),
-        (noises, "s--", COLOURS[1], "standard error of the gradient / its mean"),
+        (gaps, "o-", plot.COLOURS[0], "|surrogate / hard cost - 1|"),
+        (errors, "^-.", plot.COLOURS[2], "|gradient / difference of the hard cost - 1|"),
+        (noises, "s--", plot.COLOURS[1], "standard error of the gradient / its mean"),
     ):
         ax.loglog(levels, values, mark, color=colour, label=label)
-    ax.axvline(TEMPERATURE, color="#777777", ls=":", label="used")
+    ax.axvline(TEMPERATURE, color=plot.GREY, ls=":", label="used")
     ax.set(xlabel="temperature of the soft alarm, in J [1]", ylabel="share [1]")
     ax.grid(alpha=0.3)
     ax.legend()

@@ -17,26 +17,27 @@ import optax
 
 from experiments.report import interval, plt
 from experiments.tuning import compare
+from experiments.wheel_mrac import HARDWARE
 from jaxatt import scores, sweep, tune
-from jaxatt.bodies import Wheel
+from jaxatt.compiling import jitted
 from jaxatt.controllers import Adaptation
-from jaxatt.engine import compiled
-from jaxatt.study import batch
-from jaxatt.systems import wheel_mrac as wm
+from jaxatt.faults import Fault
+from jaxatt.loops import wheel_mrac as wm
+from jaxatt.plot import COLOURS, LINES, MARKS
 from jaxatt.tuning import bounded, gradient_check, value_and_gradient
+from jaxatt.wheels import Wheel
 
 TICKS = 4501  # 0 to 90 s
 TUNE, CHOOSE, JUDGE = 11, 12, 13  # seeds
 NAMES = ("K", "gamma", "P0")
 START = np.array([1.0, 1e-8, 1e-6])  # of the paper's hardware, as far as its words go
 HEAVIEST = 6.4  # [kg m^2] largest true inertia of the scenarios
-FASTEST = float(wm.slew(wm.params, 45.0)[1]) * HEAVIEST / wm.J_WHEEL  # [deg/s] wheel speed that its slew needs
+FASTEST = wm.fastest(wm.params) * HEAVIEST / wm.J_WHEEL  # [deg/s] wheel speed that its slew needs
 STABLE = 0.5 / (wm.DT * 2 * FASTEST**2)  # [s/deg^2] gamma up to which the sampled law is stable there (choice 5)
 LOW, HIGH = np.array([0.1, 1e-10, 1e-9]), np.array([30.0, STABLE, 1e-3])
 GAINS = bounded(tuple(LOW), tuple(HIGH))
 CHATTER = 1e-8  # [s^2] weight of the squared step of the desired wheel speed (docs/loops/wheel_mrac.md)
-COARSE = wm.loop(sampled=True, substeps=4)
-BLUE, ORANGE, GREEN, PINK = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
+COARSE = wm.system_of(sampled=True, substeps=4)
 
 
 def run(report) -> None:
@@ -54,18 +55,18 @@ def run(report) -> None:
 def shipped(gains):
     """Params with the gains (K [1/s], gamma [s/deg^2], P0 [1/(deg^2 s)])."""
     K, gamma, P0 = gains
-    return wm.hardware_params._replace(J_hat=5.0, ope=1.0, K=K, law=Adaptation(gamma=gamma), P0=P0)
+    return HARDWARE._replace(J_hat=5.0, ope=1.0, K=K, law=Adaptation(gamma=gamma), P0=P0)
 
 
 def world(n: int, seed: int):
     """n scenarios: true inertia within 20 % of 5.4 kg m^2, low-speed friction, effectiveness lost between 12 and 80 s."""
     rng = np.random.default_rng(seed)
-    scenarios = batch(wm.scenario, n)
-    return scenarios._replace(
-        J_z=rng.uniform(4.4, HEAVIEST, n),
-        wheel=scenarios.wheel._replace(friction=rng.uniform(0.0, 3e4, n)),
-        drive=scenarios.drive._replace(onset=rng.uniform(12.0, 80.0, n), scale=rng.uniform(0.2, 1.0, n)),
-    )
+
+    def draw(J_z, friction, onset, scale):
+        return wm.scenario._replace(J_z=J_z, wheel=Wheel(friction=friction), drive=Fault(onset=onset, scale=scale))
+
+    ranges = (4.4, HEAVIEST), (0.0, 3e4), (12.0, 80.0), (0.2, 1.0)
+    return jax.vmap(draw)(*(rng.uniform(low, high, n) for low, high in ranges))
 
 
 def terms(params, scenario, now, log):
@@ -102,7 +103,7 @@ def choose(report, history, n: int):
     there, key = world(n, CHOOSE), jax.random.key(CHOOSE)
     points = np.stack(history.theta, axis=1)
     few = points[np.argsort(np.where(np.isfinite(history.cost), history.cost, np.inf))[:5]]
-    judge = compiled(lambda gains: tuning_cost(gains, key, there), 0)
+    judge = jitted(lambda gains: tuning_cost(gains, key, there))
     costs = [float(judge(x)) for x in few]
     chosen = few[int(np.nanargmin(costs))]
     report.note(
@@ -134,16 +135,16 @@ def verdict(report, chosen, n: int) -> None:
         "rms step of r [deg/s]": (terms_before[1], terms_after[1], root),
         "peak true error, median [deg]": (before.peak, after.peak, np.median),
         "peak true error, 95 % below [deg]": (before.peak, after.peak, partial(np.quantile, q=0.95)),
-        "peak after the fault, median [deg]": (before.peak_ill, after.peak_ill, np.median),
+        "peak after the fault, median [deg]": (before.peak_faulty, after.peak_faulty, np.median),
     }
     for name, (a, b, statistic) in pairs.items():
         report.note(compare.told(name, compare.paired_ratio(a[both], b[both], statistic, 1000), ratio=True))
-    settled = [np.isfinite(s.settling_ill[both]) & (s.settling_ill[both] < 5) for s in (before, after)]
+    settled = [np.isfinite(s.settling_faulty[both]) & (s.settling_faulty[both] < 5) for s in (before, after)]
     report.note(compare.told("within 0.05 deg 5 s after the fault", compare.paired_share(*settled)))
     falsely = [s.false_alarms[both] > 0 for s in (before, after)]
     report.note(compare.told("runs with a false alarm of |y - y_m|", compare.paired_share(*falsely)))
     fig, ax = plt.subplots(figsize=(6, 4.5), layout="constrained")
-    ax.loglog(before.peak[both], after.peak[both], ".", ms=3, color=BLUE, alpha=0.4)
+    ax.loglog(before.peak[both], after.peak[both], ".", ms=3, color=COLOURS[0], alpha=0.4, label="a scenario")
     ends = [before.peak[both].min(), before.peak[both].max()]
     ax.plot(ends, ends, color="k", lw=0.8, label="no change")
     ax.set(
@@ -159,8 +160,8 @@ def verdict(report, chosen, n: int) -> None:
 def against_baselines(report, cost, gradient, budget: int, seeds) -> None:
     """Random search, CMA-ES and Nelder-Mead on the same cost, bounds and start."""
     key = jax.random.key(TUNE)
-    value = compiled(lambda logs: cost(jnp.exp(logs), key), 0)
-    slope = compiled(lambda logs: value_and_gradient(lambda logs, key: cost(jnp.exp(logs), key), logs, key), 0)
+    value = jitted(lambda logs: cost(jnp.exp(logs), key))
+    slope = jitted(lambda logs: value_and_gradient(lambda logs, key: cost(jnp.exp(logs), key), logs, key))
     start, low, high = np.log(START), np.log(LOW), np.log(HIGH)
     dearer = compare.cpu_ratio(slope, value, start)
     costs = compare.one_by_one(value)
@@ -176,13 +177,13 @@ STEPS = (1e-4, 1e-2, 0.3)  # of the central difference, in log K
 
 def stuck(n: int):
     """n noisy slews for each kind and size of friction: scenarios of shape (kinds * sizes * n,)."""
-    cases = [(kind, size) for kind in KINDS for size in SIZES]
     wheels = []
-    for kind, size in cases:
-        width = size / 20.0 if kind in ("dead_zone", "gate") else size  # b_p = 20 1/s
-        wheels.append(Wheel(**{kind: width}))
-    wheel = jax.tree.map(lambda *a: np.repeat(np.array(a, float), n), *wheels)
-    return batch(wm.scenario, n * len(cases))._replace(wheel=wheel)
+    for kind in KINDS:
+        for size in SIZES:
+            width = size / 20.0 if kind in ("dead_zone", "gate") else size  # b_p = 20 1/s
+            wheels += [Wheel(**{kind: width})] * n
+    wheel = jax.tree.map(lambda *a: np.array(a, float), *wheels)
+    return jax.vmap(lambda wheel: wm.scenario._replace(wheel=wheel))(wheel)
 
 
 def slopes(n: int):
@@ -193,8 +194,8 @@ def slopes(n: int):
         return jnp.log(each_cost((jnp.exp(log_K), START[1], START[2]), key, scenarios, wm.sampled))
 
     shape = (len(KINDS), len(SIZES), n)
-    exact = compiled(lambda a: jax.jvp(lambda a: each(a, key), (a,), (1.0,))[1], 0)
-    value = compiled(lambda a: each(a, key), 0)
+    exact = jitted(lambda a: jax.jvp(lambda a: each(a, key), (a,), (1.0,))[1])
+    value = jitted(lambda a: each(a, key))
     central = [np.asarray(value(h) - value(-h)).reshape(shape) / (2 * h) for h in STEPS]
     return np.asarray(exact(0.0)).reshape(shape), central
 
@@ -215,20 +216,19 @@ def stick_slip(report, n: int) -> None:
     smooth = np.median(np.abs(exact[:, 0] / central[0][:, 0] - 1))
     report.within("no friction: median |gradient / central difference - 1|", None, 1e-5, smooth, "smooth case")
     fig, (left, right) = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
-    colours, marks = (BLUE, ORANGE, GREEN, PINK), "os^D"
     at = np.array([1e3, *SIZES[1:]])
     for i, kind in enumerate(KINDS):
-        label = kind.replace("_", " ")
-        spread = exact[i].std(axis=1, ddof=1)
-        left.semilogx(at, exact[i].mean(axis=1), color=colours[i], marker=marks[i], label=label)
-        left.fill_between(at, exact[i].mean(1) - spread, exact[i].mean(1) + spread, color=colours[i], alpha=0.15, lw=0)
+        label, look = kind.replace("_", " "), dict(color=COLOURS[i], marker=MARKS[i])
+        mean, spread = exact[i].mean(axis=1), exact[i].std(axis=1, ddof=1)
+        left.semilogx(at, mean, ls=LINES[i], label=label, **look)
+        left.fill_between(at, mean - spread, mean + spread, color=COLOURS[i], alpha=0.15, lw=0)
         for c, style, name in ((central[1], "-", "0.01"), (central[2], ":", "0.3")):
             apart = np.median(np.abs(exact[i] / c[i] - 1), axis=1)
-            right.loglog(at, apart, color=colours[i], ls=style, marker=marks[i], ms=4, label=f"{label}, step {name}")
+            right.loglog(at, apart, ls=style, ms=4, label=f"{label}, step {name}", **look)
     left.set(ylabel="d log cost / d log K [1], mean and spread over runs", title="Exact gradient")
     right.set(ylabel="median |gradient / difference - 1| [1]", title="Against central differences")
     for ax in (left, right):
-        ax.set_xlabel("friction, stiction, b$_p$ x dead zone or gate [deg/s$^2$]")
+        ax.set_xlabel("friction, stiction, $b_p$ x dead zone or gate [deg/s$^2$]")
         ax.set_xticks([1e3, 1e4, 1e5], ["none", "$10^4$", "$10^5$"])
         ax.grid(alpha=0.3)
         ax.legend(fontsize=7, ncols=1 if ax is left else 2)

@@ -1,0 +1,153 @@
+"""What the compiler needs: values computed once, jitted functions with CPU settings, the compilation cache.
+
+May import: check.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import platform
+import warnings
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+from jax.core import Tracer
+
+from jaxatt import check
+
+
+def shared(f: Callable, *operands):
+    """f(*operands), computed once for all that use it.
+
+    XLA's CPU compiler repeats a shared subexpression in every output that uses it, unless a control-flow boundary
+    keeps them apart. This boundary is always taken, but the compiler does not know it.
+    """
+    traced_operands = [leaf for leaf in jax.tree.leaves(operands) if isinstance(leaf, Tracer)]
+    if not traced_operands:
+        return f(*operands)
+    f = jax.jit(f, inline=True)  # traced once for its shapes and its values
+    # tied to an operand, lest reverse mode on JAX 0.10 takes the branch apart before the operand is known
+    always, _ = jax.lax.optimization_barrier((jnp.asarray(True), jax.lax.stop_gradient(traced_operands[0])))
+    return jax.lax.cond(always, f, lambda *_: zeros(jax.eval_shape(f, *operands)), *operands)
+
+
+def zeros(shapes):
+    """A tree of zeros of the shapes and types given."""
+    return jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
+
+
+def traced(*operands) -> bool:
+    """Whether the caller, or one of the operands, is being traced by jit, grad or vmap."""
+    return not check.concrete((operands, jnp.zeros(()) + 0))  # inside jit even 0 + 0 is a tracer
+
+
+def compiled(f: Callable, static: int, *operands) -> Callable:
+    """The module-level function f jitted, its first ``static`` arguments static, with our settings for the CPU.
+
+    A jit inside another may carry no settings, hence the look at the operands. Every f is kept for the life of the
+    process: hand closures to `jitted`.
+    """
+    return _jitted_once(f, static, traced(*operands))
+
+
+@cache
+def _jitted_once(f: Callable, static: int, plain: bool):
+    return jax.jit(f, static_argnums=tuple(range(static))) if plain else jitted(f, static)
+
+
+def jitted(f: Callable, static: int = 0) -> Callable:
+    """f jitted with our settings for the CPU; nothing is kept once f and the result are gone."""
+    options = {"xla_cpu_prefer_vector_width": 512} if jax.default_backend() == "cpu" else None
+    return jax.jit(f, static_argnums=tuple(range(static)), compiler_options=options)
+
+
+_FLAGS = {
+    "--xla_cpu_prefer_vector_width": "512",
+    # loops of up to 10 MB become one compiled function; larger ones, of gradients, would take minutes to compile
+    "--xla_backend_extra_options": "xla_cpu_small_while_loop_byte_threshold=10000000",
+}
+
+
+def configure(cache: str | Path | None = None) -> Path:
+    """Switch on JAX's persistent compilation cache and the CPU compiler's flags for loops.
+
+    With the cache a program is compiled once per machine, not once per process: the first sweep of a second process
+    takes about a second. The flags matter on JAX 0.10, where sweeps then run two to three times as fast; JAX 0.12 needs
+    none. Call it once at the start of a script or notebook; a second call changes nothing. Nothing else in jaxatt
+    changes a setting of the process.
+
+    Args:
+        cache: folder of compiled programs; None for ``jaxatt`` in the user's cache folder. Processors and releases of
+            JAX get folders of their own in it, for a program compiled for one fails on another. What
+            JAX_COMPILATION_CACHE_DIR or jax.config says already stays.
+
+    Returns:
+        The folder in use.
+
+    Warns:
+        UserWarning if JAX has run a computation already, so that the flags come too late; the cache still works.
+
+    Example:
+        >>> import jaxatt
+        >>> folder = jaxatt.configure()
+    """
+    if jax.__version_info__ < (0, 12):
+        present = os.environ.get("XLA_FLAGS", "")
+        wanted = [f"{name}={value}" for name, value in _FLAGS.items() if name not in present]
+        if wanted and _has_run():
+            warnings.warn(
+                "`jaxatt.configure` comes after the first computation of JAX: the compiler's flags have no effect any "
+                "more, and sweeps run two to three times slower. Call it first.",
+                stacklevel=2,
+            )
+        elif wanted:
+            os.environ["XLA_FLAGS"] = " ".join([present, *wanted]).strip()
+    if not jax.config.jax_compilation_cache_dir:  # pyright: ignore[reportAttributeAccessIssue]
+        place = _cache_home() if cache is None else check.place("cache", cache)
+        folder = place / f"jax-{jax.__version__}-{_processor()}"
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+        jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+        if jax.__version_info__ < (0, 12):
+            _quiet_loader()
+    return Path(jax.config.jax_compilation_cache_dir)  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def _quiet_loader() -> None:
+    """Silence what JAX 0.10 prints at every program it loads: that its own tuning hints are no features of the machine.
+
+    It comes from C++, whose level is set by jax_logging_level alone; the Python loggers keep theirs.
+    """
+    loggers = [logging.getLogger(name) for name in ("jax", "jaxlib")]
+    before = [logger.level for logger in loggers]
+    asked = jax.config.jax_logging_level  # pyright: ignore[reportAttributeAccessIssue]
+    if asked in (None, "", "NOTSET"):
+        jax.config.update("jax_logging_level", "CRITICAL")
+        jax.config.update("jax_logging_level", asked)
+        for logger, level in zip(loggers, before):
+            logger.setLevel(level)
+
+
+def _has_run() -> bool:
+    """Whether JAX has started its backend; False where this release does not say."""
+    bridge = getattr(getattr(jax, "_src", None), "xla_bridge", None)
+    return bool(getattr(bridge, "backends_are_initialized", lambda: False)())
+
+
+def _cache_home() -> Path:
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jaxatt"
+
+
+def _processor() -> str:
+    """Kind of processor: its architecture and a checksum of its model and instruction sets."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        kind = sorted({line for line in lines if line.startswith(("model name", "flags", "Features", "CPU part"))})
+    except OSError:
+        kind = [platform.processor()]
+    return f"{platform.machine()}-{hashlib.sha256(' '.join(kind).encode()).hexdigest()[:8]}"

@@ -1,0 +1,160 @@
+"""How good a detector is: ROC curves, delays, chance levels, intervals, confusion.
+
+Values of an evaluation (`jaxatt.detection`) in runs without a fault are called healthy, in runs with one faulty.
+
+May import: check, detection.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxatt import check
+from jaxatt.detection import CAUSES
+
+
+class Roc(NamedTuple):
+    """False-alarm and detection rates over falling thresholds; every field has shape (thresholds,)."""
+
+    threshold: Any  # [unit of the evaluation]
+    false_alarm: Any  # [1] share of healthy values above it
+    detection: Any  # [1] share of faulty values above it
+
+
+def roc(healthy, faulty, thresholds=None) -> Roc:
+    """The ROC curve of an evaluation.
+
+    Args:
+        healthy, faulty: its values without and with a fault, of any shapes. A run that alarms at least once in a window
+            is described by its largest value there.
+        thresholds: where to take the curve; None takes every value that occurs.
+
+    Raises:
+        ValueError: no value, or NaN among them.
+
+    Example:
+        >>> area(roc([1.0, 2.0], [2.0, 3.0]))
+        0.875
+    """
+    healthy, faulty = _values("healthy", healthy), _values("faulty", faulty)
+    if thresholds is None:
+        at = np.unique(np.concatenate([healthy, faulty, [-np.inf]]))[::-1]
+    else:
+        at = _values("thresholds", thresholds)[::-1]
+    above = lambda values: 1 - np.searchsorted(values, at, side="right") / len(values)
+    return Roc(at, above(healthy), above(faulty))
+
+
+def detection_at(healthy, faulty, false_alarm) -> float:
+    """The detection rate at the lowest threshold whose false-alarm rate is at most false_alarm.
+
+    healthy, faulty: values of the evaluation, of any shapes. Raises ValueError for no value, NaN, and a rate that is not
+    in [0, 1].
+    """
+    healthy, faulty = _values("healthy", healthy), _values("faulty", faulty)
+    check.number("false_alarm", false_alarm)
+    check.share("false_alarm", false_alarm)
+    allowed = int(np.floor(false_alarm * len(healthy) + 1e-9))
+    threshold = healthy[len(healthy) - 1 - allowed] if allowed < len(healthy) else -np.inf
+    return float(np.mean(faulty > threshold))
+
+
+def area(curve: Roc) -> float:
+    """Area under a ROC curve: the probability that a faulty value exceeds a healthy one.
+
+    Raises ValueError for rates that are not two series of one length.
+    """
+    check.kind("curve", curve, Roc)
+    shapes = (
+        np.shape(check.real("curve.false_alarm", curve.false_alarm)),
+        np.shape(check.real("curve.detection", curve.detection)),
+    )
+    if shapes[0] != shapes[1] or len(shapes[0]) != 1:
+        check.refuse("curve", "hold rates of shape (thresholds,)", "of shapes {} and {}".format(*shapes))
+    x = np.concatenate([[0], curve.false_alarm, [1]])
+    y = np.concatenate([[0], curve.detection, [1]])
+    return float(np.sum(np.diff(x) * (y[1:] + y[:-1]) / 2))
+
+
+def first_alarm(alarms, t, since: Any = 0.0):
+    """Time [s] from since to the first alarm not before it, inf if never, shape (...).
+
+    alarms: bool (T, ...), at the times t (T,) [s]; since: [s], one number or one for each run. Raises ValueError where
+    alarms and times differ in number.
+    """
+    for name, value in (("alarms", alarms), ("t", t), ("since", since)):
+        if check.concrete(value):
+            check.real(name, value)
+    alarms, t = jnp.asarray(alarms, bool), jnp.asarray(t)
+    if alarms.ndim == 0 or t.shape != alarms.shape[:1] or len(t) == 0:
+        check.refuse("alarms", f"lead with as many ticks as `t`, of shape {t.shape}, at least one", f"{alarms.shape}")
+    if np.shape(since) not in ((), alarms.shape[1:]):
+        check.refuse("since", f"be one number or have shape {alarms.shape[1:]}", f"of shape {np.shape(since)}")
+    t = t.reshape(-1, *(1,) * (alarms.ndim - 1))
+    return jnp.min(jnp.where(alarms & (t >= since), t - since, jnp.inf), axis=0)
+
+
+def detected_by(delays, times):
+    """Share of runs detected within each of the times [s]: the distribution of their delays [s], inf for never.
+
+    Raises ValueError for no delay, and NaN.
+    """
+    delays = _values("delays", delays)
+    times = check.real("times", times)
+    check.a_number("times", times)
+    return np.searchsorted(delays, times, side="right") / len(delays)
+
+
+def chance(false_alarm, samples):
+    """Probability of an alarm in so many independent healthy samples: what a detection is worth against.
+
+    false_alarm: probability of an alarm in one sample. Raises ValueError for one outside [0, 1] and samples < 0.
+    """
+    check.share("false_alarm", false_alarm)
+    check.not_negative("samples", samples)
+    return -jnp.expm1(samples * jnp.log1p(-jnp.asarray(false_alarm, float)))
+
+
+def interval(successes: int, trials: int, z: float = 1.959964) -> tuple[float, float]:
+    """Wilson's confidence interval of a probability from successes in trials.
+
+    z: half width in standard deviations; 95 % by default. Raises ValueError for no trial, more successes than trials, and
+    z <= 0.
+    """
+    n = check.whole("trials", trials)
+    if check.whole("successes", successes, 0) > n:
+        check.refuse("successes", f"be at most the {n} trials", successes)
+    check.positive("z", check.number("z", z))
+    p = successes / n
+    centre = (p + z * z / (2 * n)) / (1 + z * z / n)
+    half = z / (1 + z * z / n) * float(np.sqrt(p * (1 - p) / n + z * z / (4 * n * n)))
+    return max(0.0, centre - half), min(1.0, centre + half)
+
+
+def confusion(truth, verdict, causes: int = len(CAUSES)) -> np.ndarray:
+    """Counts of runs, shape (causes, causes): row what was wrong, ``truth``, column what was blamed, ``verdict``.
+
+    truth, verdict: a cause for each run, 0 to causes - 1. Raises ValueError for other numbers, and where the two differ in
+    shape.
+    """
+    causes = check.whole("causes", causes)
+    truth, verdict = check.real("truth", truth), check.real("verdict", verdict)
+    if truth.shape != verdict.shape:
+        check.refuse("verdict", f"have the shape {truth.shape} of `truth`", f"of shape {verdict.shape}")
+    for name, a in (("truth", truth), ("verdict", verdict)):
+        check.each(name, f"be a cause, 0 to {causes - 1}", a, np.isin(a, range(causes)))
+    table = np.zeros((causes, causes), int)
+    np.add.at(table, (truth.ravel().astype(int), verdict.ravel().astype(int)), 1)
+    return table
+
+
+def _values(name: str, values) -> np.ndarray:
+    """Sorted, flat values, at least one and none of them NaN."""
+    a = np.ravel(check.real(name, values))
+    if not a.size:
+        check.refuse(name, "hold at least one number", "empty")
+    check.a_number(name, a)
+    return np.sort(a)
