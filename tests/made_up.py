@@ -25,3 +25,15 @@ def tallied(score, params, scenario, log, dt):
 def repeated(tree, n):
     """n equal scenarios, every leaf (n, ...)."""
     return jax.tree.map(lambda a: np.broadcast_to(np.asarray(a), (n, *np.shape(a))), tree)
+
+
+def left(p):
+    """The matrix (4, 4) of x -> p x for a quaternion p, scalar first."""
+    w, x, y, z = p
+    return np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
+
+
+def right(q):
+    """The matrix (4, 4) of x -> x q for a quaternion q, scalar first."""
+    w, x, y, z = q
+    return np.array([[w, -x, -y, -z], [x, w, z, -y], [y, -z, w, x], [z, y, -x, w]])

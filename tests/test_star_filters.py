@@ -6,22 +6,13 @@ jax.config.update("jax_enable_x64", True)
 
 import numpy as np  # noqa: E402
 import pytest  # noqa: E402
+from made_up import left, right  # noqa: E402
 
 from jaxatt import Quat, Reading, Vec3, star_filters  # noqa: E402
 from jaxatt.star_filters import AttitudeBias, Belief, Moments, star_angle  # noqa: E402
 
 DT = 0.1
 S, W, W_R = Vec3(0.6, 0.0, 0.8), Vec3(0.01, 0.02, -0.03), Vec3(0.0, -1e-3, 0.0)
-
-
-def left(p):
-    w, x, y, z = p
-    return np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
-
-
-def right(q):
-    w, x, y, z = q
-    return np.array([[w, -x, -y, -z], [x, w, z, -y], [y, -z, w, x], [z, y, -x, w]])
 
 
 def covariance(n, seed=0):

@@ -10,7 +10,7 @@ from functools import partial  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 import pytest  # noqa: E402
-from made_up import repeated, tallied  # noqa: E402
+from made_up import left, repeated, right, tallied  # noqa: E402
 
 import jaxatt  # noqa: E402
 from jaxatt import Fault, Quat, Vec3, detection, scores, star_filters  # noqa: E402
@@ -61,16 +61,6 @@ def test_the_spacecraft_starts_off_its_pointing_by_what_the_reference_says():
 
 
 # the filter in plain matrices
-
-
-def left(p):
-    w, x, y, z = p
-    return np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
-
-
-def right(q):
-    w, x, y, z = q
-    return np.array([[w, -x, -y, -z], [x, w, z, -y], [y, -z, w, x], [z, y, -x, w]])
 
 
 def in_body(q, v):
