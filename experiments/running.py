@@ -30,11 +30,11 @@ class Experiment(NamedTuple):
 
 
 EXPERIMENTS = {
-    "observer_pd": Experiment(30, 29, "fault_sizes"),
+    "observer_pd": Experiment(24, 29, "fault_sizes"),
     "gyro_ekf": Experiment(50, 55, "sixteen_subsets"),
-    "cmg_loss": Experiment(80, 88, "figure_7"),
+    "cmg_loss": Experiment(100, 88, "figure_7"),
     "star_isolation": Experiment(70, 88, "roc"),
-    "wheel_mrac": Experiment(60, 77, "loss_of_effectiveness"),
+    "wheel_mrac": Experiment(30, 77, "loss_of_effectiveness"),
 }
 NAMES = tuple(EXPERIMENTS)
 STUDIES = {"tune": "experiments.tuning"}  # words that may follow the names, and where the studies lie
@@ -108,7 +108,7 @@ def watch(running: dict[str, Future], study: str, quick: bool, out: Path) -> Non
         for name, future in running.items():
             path = table_of(out, name)
             lines = path.read_text().splitlines() if path.exists() else []
-            checks = [line for line in lines if line.endswith((" ok", " NOT OK"))]
+            checks = [line for line in lines if line.endswith((" ok", " NOT OK")) and not line.startswith("check ")]
             ended = ("failed" if future.exception() else "done") if future.done() else ""
             last = checks[-1][:48].strip() if checks else "..." if lines else "waits"
             bars[name].n = len(checks)
