@@ -498,3 +498,8 @@ def test_scores_are_those_of_a_made_up_log():
     }  # fmt: skip
     for name in star.Scores._fields:
         np.testing.assert_allclose(getattr(got, name), found[name], rtol=1e-12, err_msg=name)
+
+
+def test_equal_arguments_give_one_system():
+    assert star.system_of() is star.system_of(star_filters.LMMSE, window=1, dt=star.DT) is star.system
+    assert star.system_of(star_filters.MEKF) is not star.system

@@ -341,14 +341,12 @@ def refuse_bad(star_filter: StarFilter, params: Params, scenario: Scenario) -> N
         check.precise(f"{said} turns the estimates about their stars' lines of sight", (params, scenario))
 
 
-@lru_cache
 def system_of(star_filter: StarFilter = LMMSE, window: int = 1, dt: float = DT) -> System:
     """The loop with another filter, window or sampling; equal arguments give the same system, which compiles once.
 
     Args:
         star_filter: `LMMSE`, `WITH_BIAS` or `MEKF` of `jaxatt.star_filters`.
-        window: how many values the evaluation (18) sums. The threshold belongs to it: ``threshold_quantile(1e-6,
-            3 * window)``, for instance.
+        window: how many values the evaluation (18) sums; ``threshold_quantile(1e-6, 3 * window)`` suits it.
         dt: [s] of a tick.
 
     Raises:
@@ -358,7 +356,11 @@ def system_of(star_filter: StarFilter = LMMSE, window: int = 1, dt: float = DT) 
         >>> seven = system_of(WITH_BIAS, window=10)
     """
     check.positive("dt", dt)
-    window = check.whole("window", window)
+    return _system_of(star_filter, check.whole("window", window), float(dt))
+
+
+@lru_cache
+def _system_of(star_filter: StarFilter, window: int, dt: float) -> System:
     functions = partial(init, star_filter, window), partial(tick, star_filter), flow
     return System(*functions, dt=dt, normals=12, check=partial(refuse_bad, star_filter))
 
