@@ -36,6 +36,7 @@ from jaxatt.faults import Reading
 from jaxatt.linear import sampled
 from jaxatt.loops import observer_pd
 from jaxatt.noise import noise_of
+from jaxatt.pointing import indices, interpret, runs_needed, upper_bound
 from jaxatt.replay import checked, replay, resample, together
 from jaxatt.sweeping import rerun, sweep, varied
 from jaxatt.tuning import (
@@ -302,6 +303,12 @@ DATA = {
     "detected_by": (detected_by, dict(delays=series, times=series)),
     "chance": (chance, dict(false_alarm=shares, samples=st.one_of(st.just(10), plain()))),
     "interval": (interval, dict(successes=whole, trials=whole, z=plain())),
+    "indices": (indices, dict(error=series, dt=st.one_of(st.just(1.0), plain()), window=st.one_of(st.just(2.0), plain()),
+                              apart=st.one_of(st.none(), st.just(3.0), plain()))),
+    "interpret": (interpret, dict(values=st.one_of(arrays([(5, 2), (5, 3, 2), (5,), (0, 2)]), plain()), level=shares,
+                                  how=st.sampled_from(["ensemble", "temporal", "mixed", "worst", None, 3]))),
+    "runs_needed": (runs_needed, dict(level=shares, confidence=shares, rank=whole)),
+    "upper_bound": (upper_bound, dict(values=series, level=shares, confidence=shares)),
     "confusion": (confusion, dict(truth=blamed, verdict=blamed, causes=whole)),
 }  # fmt: skip
 ALSO = {"time", "a", "b", "q", "scenarios"}  # the channels and times that a message names
@@ -313,6 +320,7 @@ fitting = GOOD | dict(
     computer=Computer(0.0, 0.5), between=None, n=60, x=np.ones(120),
     y=np.ones(120), healthy=np.arange(5.0), faulty=np.arange(5.0), thresholds=None, false_alarm=0.1, curve=Roc(*np.ones((3, 4))),
     alarms=np.arange(5) > 2, since=0.0, delays=np.ones(5), times=np.ones(5), samples=10, z=2.0, truth=[0, 1, 2], verdict=[0, 2, 2], causes=5,
+    error=np.arange(5.0), window=2.0, apart=None, values=np.ones((5, 2)), how="mixed", confidence=0.5, rank=1,
 )  # fmt: skip
 
 
