@@ -28,7 +28,17 @@ KEY = jax.random.key(0)
 # is it all of them?
 
 
-MEETING = ["campaign", "evaluation", "plot", "pointing", "replay", "sweeping", "tuning", "campaign.designs", "campaign.summary"]
+MEETING = [
+    "campaign",
+    "evaluation",
+    "plot",
+    "pointing",
+    "replay",
+    "sweeping",
+    "tuning",
+    "campaign.designs",
+    "campaign.summary",
+]
 # public for the modules of the house: what they get has been checked before
 HOUSE = {"sweeping": "block_log block_of block_records block_scores logged progress_bar score_shapes scored"}
 
