@@ -16,7 +16,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 import jaxatt
-from experiments.report import interval
+from experiments.report import interval, quantile
 from jaxatt import plot
 from jaxatt.attitude import quat_from_euler, quat_rotate
 from jaxatt.faults import Fault, dead, dead_where
@@ -385,7 +385,9 @@ def monte_carlo(report) -> None:
             low, high = interval(int(good.sum()), each)
             text = f"{name} dead, {how}: {good.sum()} of {each} converge, share {low:.3f} to {high:.3f}"
             final = loop.final_error[here] / DEG
-            text += f"; median settling {np.median(loop.settling[here]):.0f} s, angle at the end {np.median(final):.1e}"
+            text += (
+                f"; median settling {quantile(loop.settling[here], 0.5)} s, angle at the end {quantile(final, 0.5, 2)}"
+            )
             report.note(f"{text}, largest {final.max():.1e} deg")
             if how == "filter":
                 report.within(f"share that converges, {name} dead, filter", 1, None, good.mean(), "required: all")
@@ -463,7 +465,7 @@ def reconfiguration(report) -> None:
         shares[name], delays[name] = (right.mean(), low, high), (when - begin)[right]
         late = "none"
         if right.any():
-            late = f"{np.median(delays[name]):.2f} s, 95 % {np.quantile(delays[name], 0.95):.2f} s"
+            late = f"{quantile(delays[name], 0.5)} s, 95 % below {quantile(delays[name], 0.95)} s"
         end = v.final_error.max() / DEG
         report.note(f"{name}: isolated {right.sum()} of {n} ({low:.3f} to {high:.3f}), delay {late}")
         report.note(f"  a healthy gyro dropped too: {also:.3f}; largest pointing error at 400 s {end:.1e} deg")

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 
-from experiments.report import interval
+from experiments.report import interval, quantile
 from jaxatt import Fault, noise_of, on_axes, scores, simulate, soft_scores, sweep
 from jaxatt.attitude import mrp_matrix, mrp_rate, mrp_rate_transposed
 from jaxatt.bodies import body_acceleration
@@ -254,7 +254,7 @@ def fault_sizes(report) -> None:
                 sizes, low, high, color=COLOURS[i], alpha=0.2, linewidth=0, label=f"{label}: 95 % interval"
             )
             miss_ax.plot(sizes, miss.mean(1), **style)
-            text = "  ".join(f"{s:.3g}: {np.median(d):.3g} s" for s, d in zip(sizes, delay))
+            text = "  ".join(f"{s:.3g}: {quantile(d, 0.5)} s" for s, d in zip(sizes, delay))
             report.note(f"{sensor}, {label}: size: median delay (inf: not found)  {text}")
         found_ax.axhline(chance.mean(), color=GREY, linestyle=":", label="chance level")
         found_ax.set(title=f"{sensor} fault".replace("star", "star-sensor"))

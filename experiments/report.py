@@ -14,6 +14,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 from jaxatt.evaluation import interval as interval
+from jaxatt.evaluation import quantile_interval
 
 
 class Report:
@@ -79,6 +80,16 @@ def written(out: Path, parts: list[dict]) -> bool:
     print(f"\n{len(checks) - len(bad)} of {len(checks)} checks ok, {len(figures)} figures; written to {out}", end="")
     print("".join(f"\nnot ok: {name}" for name in bad))
     return not bad
+
+
+def quantile(values, share: float, digits: int = 3) -> str:
+    """A quantile of independent values, those that are NaN left out, with its 95 % confidence interval, in words."""
+    values = np.ravel(values)
+    values = values[~np.isnan(values)]
+    if not values.size:
+        return "none"
+    low, high = quantile_interval(values, share)
+    return f"{np.quantile(values, share, method='inverted_cdf'):.{digits}g} ({low:.{digits}g} to {high:.{digits}g})"
 
 
 def _plain(a):

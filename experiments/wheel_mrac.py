@@ -16,7 +16,7 @@ import numpy as np
 import optax
 
 import jaxatt
-from experiments.report import Report
+from experiments.report import Report, quantile
 from jaxatt import scores
 from jaxatt.compiling import jitted
 from jaxatt.controllers import Adaptation, Mrac, mrac_input, mrac_sampled_bound, mrac_step
@@ -391,12 +391,12 @@ def large_sweep(report: Report):
     estimating = params.ope > 0
     mismatch = np.abs(scenarios.J_z / params.J_hat - 1)
     for name, on in (("MRAC only", ~estimating), ("MRAC + estimation", estimating)):
-        q = np.percentile(got.peak_faulty[on], [50, 95])
-        report.note(f"{name}: max true error after the fault, median {q[0]:.3f}, 95 % below {q[1]:.3f} deg")
+        middle, most = (quantile(got.peak_faulty[on], share) for share in (0.5, 0.95))
+        report.note(f"{name}: max true error after the fault, median {middle}, 95 % below {most} deg")
     close = np.mean(np.abs(got.J_hat / scenarios.J_z - 1)[estimating] < 0.005)
     report.within("  J_hat within 0.5 % at the end, share", 0.99, None, close, "reference, Fig. 8b")
     report.note(
-        f"estimation: J_hat stays within 0.5 % of J_z after {np.median(got.J_settling[estimating]):.1f} s (median)"
+        f"estimation: J_hat stays within 0.5 % of J_z after {quantile(got.J_settling[estimating], 0.5)} s (median)"
     )
     # e_ss = |J_z / J_hat - 1| rate / K (docs/loops/wheel_mrac.md): without friction, loss or estimation it is the peak error
     law = mismatch * 2.5339183 / params.K

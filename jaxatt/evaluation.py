@@ -118,20 +118,54 @@ def chance(false_alarm, samples):
     return -jnp.expm1(samples * jnp.log1p(-jnp.asarray(false_alarm, float)))
 
 
-def interval(successes: int, trials: int, z: float = 1.959964) -> tuple[float, float]:
-    """Wilson's confidence interval of a probability from successes in trials.
+def interval(successes: int, trials: int, level: float = 0.95) -> tuple[float, float]:
+    """Clopper and Pearson's confidence interval of a probability from successes in independent trials.
 
-    z: half width in standard deviations; 95 % by default. Raises ValueError for no trial, more successes than trials, and
-    z <= 0.
+    It covers the true probability with at least the confidence ``level``, whatever that is; of shorter intervals, such as
+    Wilson's, this holds on average only, and least for the rare failures that one counts. Raises ValueError for no trial,
+    more successes than trials, and a level outside (0, 1).
+
+    >>> low, high = interval(0, 1000)  # 0 and 0.003682
     """
-    n = check.whole("trials", trials)
-    if check.whole("successes", successes, 0) > n:
-        check.refuse("successes", f"be at most the {n} trials", successes)
-    check.positive("z", check.number("z", z))
-    p = successes / n
-    centre = (p + z * z / (2 * n)) / (1 + z * z / n)
-    half = z / (1 + z * z / n) * float(np.sqrt(p * (1 - p) / n + z * z / (4 * n * n)))
-    return max(0.0, centre - half), min(1.0, centre + half)
+    from scipy.special import betaincinv
+
+    k, n = check.whole("successes", successes, 0), check.whole("trials", trials)
+    if k > n:
+        check.refuse("successes", f"be at most the {n} trials", k)
+    check.between("level", check.number("level", level), 0, 1, "a probability")
+    tail = (1 - level) / 2
+    low = 0.0 if k == 0 else float(betaincinv(k, n - k + 1, tail))
+    high = 1.0 if k == n else 1 - float(betaincinv(n - k, k + 1, tail))
+    return low, high
+
+
+def quantile_interval(values, shares, level: float = 0.95) -> tuple[np.ndarray, np.ndarray]:
+    """Confidence intervals of quantiles from independent values, by order statistics, whatever their distribution.
+
+    Each covers its quantile with at least the confidence ``level``. An end is infinite where there are too few values to
+    bound it. Raises ValueError for no value, NaN, shares outside [0, 1], and a level outside (0, 1).
+
+    Args:
+        values: one of each run, of any shape; infinities are values like others.
+        shares: of the distribution below the quantile, of any shape; 0.5 is the median.
+        level: confidence of each interval.
+
+    Returns:
+        Lower and upper ends, each of the shape of the shares, in the unit of the values.
+
+    Example:
+        >>> low, high = quantile_interval(np.arange(1, 101), 0.5)  # 40 and 61
+    """
+    from scipy.stats import binom
+
+    values, shares = _values("values", values), check.real("shares", shares).astype(float)
+    check.share("shares", shares)
+    check.between("level", check.number("level", level), 0, 1, "a probability")
+    n, tail = len(values), (1 - level) / 2
+    padded = np.concatenate([[-np.inf], values, [np.inf]])
+    # as many values lie below the quantile as there are successes in n trials
+    low, high = binom.ppf(tail, n, shares), binom.isf(tail, n, shares) + 1
+    return padded[np.maximum(low, 0).astype(int)], padded[np.minimum(high, n + 1).astype(int)]
 
 
 def confusion(truth, verdict, causes: int = len(CAUSES)) -> np.ndarray:

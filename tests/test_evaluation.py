@@ -51,11 +51,37 @@ def test_chance_is_one_less_silence():
     assert evaluation.chance(1e-12, 1) == pytest.approx(1e-12, rel=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("k", "n", "low", "high"), [(0, 10, 0.0, 0.27753), (5, 10, 0.23659, 0.76341), (10, 10, 0.72247, 1.0)]
-)
-def test_wilson_interval(k, n, low, high):
-    assert evaluation.interval(k, n) == pytest.approx((low, high), abs=1e-5)
+@pytest.mark.parametrize("k, n, level", [(0, 10, 0.95), (5, 10, 0.95), (10, 10, 0.95), (3, 1000, 0.99)])
+def test_the_interval_of_a_rate_ends_where_the_binomial_tails_do(k, n, level):
+    low, high = evaluation.interval(k, n, level)
+    tail = pytest.approx((1 - level) / 2)
+    assert low == 0 if k == 0 else stats.binom.sf(k - 1, n, low) == tail
+    assert high == 1 if k == n else stats.binom.cdf(k, n, high) == tail
+
+
+@pytest.mark.parametrize("n, p", [(1000, 0.5), (1000, 0.1), (10_000, 0.01), (10_000, 0.002)])
+def test_the_interval_of_a_rate_covers_what_it_says_within_a_point(n, p):
+    """Exact, by the sum over all counts that have a share in it. Rarer than 20 in n it covers more: up to 98 %."""
+    k = np.arange(*stats.binom.interval(1 - 1e-9, n, p)).astype(int)
+    ends = np.array([evaluation.interval(int(a), n) for a in k])
+    covered = stats.binom.pmf(k, n, p) @ ((ends[:, 0] <= p) & (p <= ends[:, 1]))
+    assert 0.95 - 1e-8 <= covered <= 0.96
+
+
+@pytest.mark.parametrize("n", [50, 1000])
+def test_the_interval_of_a_quantile_covers_it_whatever_the_distribution(n):
+    shares = np.array([0.05, 0.5, 0.95])
+    truth = stats.expon.ppf(shares)
+    ends = [evaluation.quantile_interval(RNG.exponential(size=n), shares, 0.9) for _ in range(2000)]
+    low, high = np.swapaxes(ends, 0, 1)
+    covered = np.mean((low <= truth) & (truth <= high), 0)
+    steps = stats.binom.pmf(np.rint(n * shares), n, shares)  # order statistics move the coverage in such steps
+    assert np.all(covered >= 0.9 - 0.02) and np.all(covered <= 0.9 + 0.02 + steps)
+
+
+def test_too_few_values_bound_no_quantile_far_out():
+    low, high = evaluation.quantile_interval([1.0, 2.0, np.inf], [0.05, 0.5, 1.0])
+    assert low.tolist() == [-np.inf, -np.inf, np.inf] and high.tolist() == [2.0, np.inf, np.inf]
 
 
 def test_a_delay_counts_from_the_onset_of_each_run():
@@ -77,7 +103,9 @@ def test_a_delay_counts_from_the_onset_of_each_run():
         (lambda e: e.chance(0.1, -3), "`samples` must not be negative, but it is -3"),
         (lambda e: e.interval(1, 0), "`trials` must be a whole number of at least 1, but it is 0"),
         (lambda e: e.interval(3, 2), "`successes` must be at most the 2 trials, but it is 3"),
-        (lambda e: e.interval(1, 2, -1.0), "`z` must be a positive number, but it is -1"),
+        (lambda e: e.interval(1, 2, -1.0), "`level` must lie in (0, 1), a probability, but it is -1"),
+        (lambda e: e.quantile_interval([], 0.5), "`values` must hold at least one number, but it is empty"),
+        (lambda e: e.quantile_interval([1.0], 50), "`shares` must lie in [0, 1], but it is 50"),
         (lambda e: e.confusion([0, 1], [0]), "`verdict` must have the shape (2,) of `truth`, but it is of shape (1,)"),
         (lambda e: e.confusion([0, 4], [0, 1]), "`truth[1]` must be a cause, 0 to 3, but it is 4"),
     ],

@@ -31,7 +31,18 @@ from jaxatt.campaign.summary import (
 )
 from jaxatt.cmg import GimbalAxes, cmg_axes
 from jaxatt.engine import simulate
-from jaxatt.evaluation import Roc, area, chance, confusion, detected_by, detection_at, first_alarm, interval, roc
+from jaxatt.evaluation import (
+    Roc,
+    area,
+    chance,
+    confusion,
+    detected_by,
+    detection_at,
+    first_alarm,
+    interval,
+    quantile_interval,
+    roc,
+)
 from jaxatt.faults import Reading
 from jaxatt.linear import sampled
 from jaxatt.loops import observer_pd
@@ -302,7 +313,8 @@ DATA = {
     "first_alarm": (first_alarm, dict(alarms=st.one_of(st.just(np.arange(5) > 2), series), t=series, since=plain())),
     "detected_by": (detected_by, dict(delays=series, times=series)),
     "chance": (chance, dict(false_alarm=shares, samples=st.one_of(st.just(10), plain()))),
-    "interval": (interval, dict(successes=whole, trials=whole, z=plain())),
+    "interval": (interval, dict(successes=whole, trials=whole, level=shares)),
+    "quantile_interval": (quantile_interval, dict(values=series, shares=st.one_of(st.just((0.1, 0.9)), plain()), level=shares)),
     "indices": (indices, dict(error=series, dt=st.one_of(st.just(1.0), plain()), window=st.one_of(st.just(2.0), plain()),
                               apart=st.one_of(st.none(), st.just(3.0), plain()))),
     "interpret": (interpret, dict(values=st.one_of(arrays([(5, 2), (5, 3, 2), (5,), (0, 2)]), plain()), level=shares,
@@ -319,7 +331,7 @@ fitting = GOOD | dict(
     half_width=0.3, t=np.arange(4.0), columns={"a": np.arange(4.0)}, dt=1.0, names=["a", "b"], decide=decide, flow=None, substeps=1,
     computer=Computer(0.0, 0.5), between=None, n=60, x=np.ones(120),
     y=np.ones(120), healthy=np.arange(5.0), faulty=np.arange(5.0), thresholds=None, false_alarm=0.1, curve=Roc(*np.ones((3, 4))),
-    alarms=np.arange(5) > 2, since=0.0, delays=np.ones(5), times=np.ones(5), samples=10, z=2.0, truth=[0, 1, 2], verdict=[0, 2, 2], causes=5,
+    alarms=np.arange(5) > 2, since=0.0, delays=np.ones(5), times=np.ones(5), samples=10, shares=0.5, truth=[0, 1, 2], verdict=[0, 2, 2], causes=5,
     error=np.arange(5.0), window=2.0, apart=None, values=np.ones((5, 2)), how="mixed", confidence=0.5, rank=1,
 )  # fmt: skip
 

@@ -2,7 +2,7 @@
 
 Takes the `xarray.Dataset` of `jaxatt.campaign.dataset`; one variable is in memory at a time.
 
-May import: check.
+May import: check, evaluation.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import numpy as np
 from scipy import stats
 
 from jaxatt import check
+from jaxatt.evaluation import interval, quantile_interval
 
 
 class Rate(NamedTuple):
@@ -30,15 +31,8 @@ class Rate(NamedTuple):
 
 
 def rate_of(successes: int, trials: int, level: float = 0.95) -> Rate:
-    """Clopper and Pearson's interval of successes in trials: it covers the true share with probability >= ``level``."""
-    k, n = check.whole("successes", successes, 0), check.whole("trials", trials)
-    if k > n:
-        check.refuse("successes", f"not exceed the {n} trials", k)
-    check.between("level", check.number("level", level), 0, 1, "a probability")
-    tail = (1 - level) / 2
-    low = 0.0 if k == 0 else float(stats.beta.ppf(tail, k, n - k + 1))
-    high = 1.0 if k == n else float(stats.beta.isf(tail, k + 1, n - k))
-    return Rate(k, n, low, high)
+    """The share of successes in trials, with `jaxatt.evaluation.interval` at the confidence ``level``."""
+    return Rate(int(successes), int(trials), *interval(successes, trials, level))
 
 
 def narrowed(counts: Iterable[int], looks, half_width: float, level: float = 0.95) -> Rate:
@@ -189,11 +183,14 @@ def describe(dataset) -> str:
     if len(bad):
         lines.append(f"not good: {', '.join(map(str, bad[:20]))}{' ...' if len(bad) > 20 else ''}")
     shares, numbers, drivers = rates(dataset), quantiles(dataset), sensitivity(dataset)
-    for name, _ in columns(dataset, "score"):
+    for name, a in columns(dataset, "score"):
         unit = dataset[name.split("[")[0]].attrs.get("units", "")
         text = f"{name}{f' [{unit}]' if unit else ''}:"
         if name in numbers:
-            text += " 5 %, 50 %, 95 %: " + ", ".join(f"{a:.4g}" for a in numbers[name])
+            ends = quantile_interval(a[~np.isnan(a)], (0.05, 0.5, 0.95))
+            text += " 5 %, 50 %, 95 %: " + ", ".join(
+                f"{q:.4g} ({low:.4g} to {high:.4g})" for q, low, high in zip(numbers[name], *ends)
+            )
         elif name not in shares:
             text += " NaN in every scenario"
         for kind in (name, f"{name} finite"):
