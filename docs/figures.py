@@ -1,11 +1,14 @@
 """The site's figures: ``python docs/figures.py RESULTS`` after ``python -m experiments --quick --out RESULTS``.
 
 Takes the figures that the pages name from the results, draws the overview, and stores all as palette PNGs, a third
-of the size.
+of the size. Then it runs `benchmarks.check_cases` and puts its tables on the page `trust.md`.
 """
 
+import json
 import re
+import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -76,7 +79,48 @@ def shrunk(source: Path, target: Path) -> None:
         image.quantize(128, dither=Image.Dither.NONE).save(target, optimize=True)
 
 
+def tables_of(found: dict) -> dict[str, str]:
+    """The tables of `benchmarks.check_cases` in Markdown, by the name of their place on the page."""
+
+    def table(head: str, rows) -> str:
+        lines = [f"| {head} |", "|---" * (head.count("|") + 1) + "|", *(f"| {' | '.join(row)} |" for row in rows)]
+        return "\n".join(lines)
+
+    number = lambda row, name: f"{row[name]:.1e}" if name in row else "-"
+    cases = [
+        [r["case"], r["reference"], *(number(r, k) for k in ("attitude", "rate", "position")), r["tools"]]
+        for r in found["cases"]
+    ]
+    tools = [[r["tool"], r["how"], number(r, "rate"), number(r, "attitude"), r["remark"]] for r in found["tools"]]
+    laws = [[r["law"], f"{r['value']:.4g}", f"{r['low']:g} to {r['high']:g}"] for r in found["laws"]]
+    return {
+        "cases": table(
+            "case, at | reference | attitude [deg] | rate [rad/s] | position [m] | tools that agree to that", cases
+        ),
+        "tools": table("tool | how | rate [deg/s] | attitude [deg] | remark", tools),
+        "laws": table("law | value | allowed", laws),
+    }
+
+
+def check_cases() -> None:
+    """Run the check cases and put their tables between the marks of the page."""
+    page = HERE / "trust.md"
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "cases.json"
+        subprocess.run(
+            [sys.executable, "-m", "benchmarks.check_cases", "--json", str(out)], cwd=HERE.parent, check=True
+        )
+        tables = tables_of(json.loads(out.read_text()))
+    text = page.read_text()
+    for name, table in tables.items():
+        text = re.sub(
+            rf"(<!-- {name} -->\n).*?(<!-- end -->)", lambda m, t=table: f"{m[1]}\n{t}\n\n{m[2]}", text, flags=re.S
+        )
+    page.write_text(text)
+
+
 if __name__ == "__main__":
+    check_cases()
     jaxatt.configure()
     overview()
     shrunk(HERE / "figures" / "overview.png", HERE / "figures" / "overview.png")

@@ -99,7 +99,8 @@ def interpret(values, level: float, how: str):
     worse; `upper_bound` of the quantiles over time says what holds of runs to come.
 
     Args:
-        values: of an index, shape (T, ..., n): time first, runs last, axes or components between. Magnitudes count.
+        values: of an index, shape (T, ..., n): time first, runs last, axes or components between; (T,) is one run.
+            Magnitudes count.
         level: probability, in (0, 1).
         how: "ensemble", "temporal" or "mixed".
 
@@ -118,11 +119,11 @@ def interpret(values, level: float, how: str):
         check.refuse("how", f"be one of {', '.join(kinds)}", check.short(how))
     level = _probability("level", level, "the probability of the requirement")
     values, xp = _numbers("values", values)
-    if values.ndim < 2 or not values.size:
+    if values.ndim == 0 or not values.size:
         check.refuse(
             "values", "hold numbers of shape (T, ..., n), time first and runs last", f"of shape {values.shape}"
         )
-    values = xp.abs(values)
+    values = xp.abs(values[:, None] if values.ndim == 1 else values)
     values = xp.where(xp.isnan(values).any(0), np.inf, values)
     _report(values[0])
     match how:

@@ -132,5 +132,47 @@ def test_a_tool_that_is_right_agrees_once_the_turn_of_the_earth_is_removed(tmp_p
     assert rate < 1e-11 and attitude < 1e-9
 
 
+# the pages that speak of it
+
+
+CI = (ROOT / ".ci/run").read_text()
+PAGE = (ROOT / "docs/guides/credibility.md").read_text()
+
+
+def table_under(page: str, head: str) -> list[list[str]]:
+    """The cells of the first table under a heading, without its head."""
+    lines = page.partition(f"## {head}\n")[2].partition("\n|")[2].partition("\n\n")[0].splitlines()
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[2:]]
+
+
 def test_ci_runs_the_cases():
-    assert re.search(r"^python -m benchmarks\.check_cases$", (ROOT / ".ci/run").read_text(), re.M)
+    assert re.search(r"^python -m benchmarks\.check_cases$", CI, re.M) and "&& pytest\n" in CI
+
+
+def test_every_evidence_cell_links_to_a_command_that_ci_runs():
+    rows = table_under(PAGE, "The eight factors")
+    assert len(rows) == 8
+    for factor, _, evidence, gap in rows:
+        links = re.findall(r"\[`([^`]+)`\]\(\.\./\.\./([^)]+)\)", evidence)
+        assert links and gap, factor
+        for command, path in links:
+            assert (ROOT / path).exists(), path
+            known = command == path == ".ci/run" or command == f"pytest {path}"
+            assert known or (command in CI.splitlines() and command.split()[-1] == path[:-3].replace("/", ".")), command
+
+
+@pytest.mark.parametrize("page", ["guides/credibility.md", "trust.md", "limits.md"])
+def test_validated_and_flight_stand_in_negations_alone(page):
+    text = re.sub(r"\s+", " ", re.sub(r"```.*?```", "", (ROOT / "docs" / page).read_text(), flags=re.S))
+    for clause in re.split(r"[.;|:]|, (?:and|but) ", text):
+        if re.search(r"\b(validated|flight|flown)\b", clause, re.I):
+            assert re.search(r"\b(not|no|nor|never|nothing|none)\b", clause, re.I), clause
+
+
+def test_the_page_shows_every_case_of_the_command():
+    rows = table_under((ROOT / "docs/trust.md").read_text(), "Other people's cases")
+    shown = [(row[0], row[1]) for row in rows if row[1] != "Basilisk"]
+    listed = [(f"{c.name}, {', '.join(f'{r.t:g}' for r in c.rows)} s", c.source) for c in CASES]
+    assert shown == [*listed, (f"Atmos_02 brick, {', '.join(map(str, BRICK))} s", "DOP853")]
+    for row in rows:
+        assert float(row[2]) <= (1e-8 if "brick" in row[0] else 1e-9) and all(row), row[0]

@@ -72,11 +72,11 @@ def test_the_interval_of_a_rate_covers_what_it_says_within_a_point(n, p):
 def test_the_interval_of_a_quantile_covers_it_whatever_the_distribution(n):
     shares = np.array([0.05, 0.5, 0.95])
     truth = stats.expon.ppf(shares)
-    ends = [evaluation.quantile_interval(RNG.exponential(size=n), shares, 0.9) for _ in range(2000)]
+    ends = [evaluation.quantile_interval(RNG.exponential(size=n), shares, 0.9) for _ in range(1000)]
     low, high = np.swapaxes(ends, 0, 1)
     covered = np.mean((low <= truth) & (truth <= high), 0)
     steps = stats.binom.pmf(np.rint(n * shares), n, shares)  # order statistics move the coverage in such steps
-    assert np.all(covered >= 0.9 - 0.02) and np.all(covered <= 0.9 + 0.02 + steps)
+    assert np.all(covered >= 0.9 - 0.03) and np.all(covered <= 0.9 + 0.03 + steps)
 
 
 def test_too_few_values_bound_no_quantile_far_out():

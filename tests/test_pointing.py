@@ -114,7 +114,7 @@ def test_the_worked_numbers_of_the_mixed_interpretation(b, value):
 logs = hnp.arrays(float, st.tuples(st.integers(1, 12), st.integers(1, 12)), elements=st.floats(-9, 9) | st.just(np.nan))
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(logs, st.floats(0.001, 0.999) | st.sampled_from([0.5, 0.9, 0.9973, 1 / 3, 0.75]))
 @pytest.mark.filterwarnings("ignore:.*hold NaN")
 def test_ensemble_and_temporal_are_never_below_mixed_on_any_log(values, level):
@@ -129,6 +129,12 @@ def test_a_level_counts_as_it_is_written():
     values = np.arange(1.0, 10_001.0)[None]
     assert interpret(values, 0.9973, "ensemble") == 9973
     assert interpret(values, 0.07, "ensemble") == 700 and 0.07 * 10_000 > 700
+
+
+def test_one_series_is_one_run():
+    e = RNG.standard_normal(500)
+    assert interpret(e, 0.9, "ensemble") == np.abs(e).max()
+    assert interpret(e, 0.9, "temporal") == interpret(e, 0.9, "mixed") == np.sort(np.abs(e))[449]
 
 
 def test_a_run_with_nan_exceeds_every_limit_and_is_reported():
@@ -227,7 +233,7 @@ def test_pooled_instants_would_claim_what_they_do_not_hold():
         (lambda: upper_bound(["far"], 0.5, 0.9), "`values` must hold real numbers"),
         (lambda: runs_needed(0.9, 0.0), "`confidence` must lie in (0, 1), the confidence of the bound, but it is 0"),
         (lambda: runs_needed(0.9, 0.9, 0), "`rank` must be a whole number of at least 1"),
-        (lambda: interpret(np.ones(5), 0.9, "mixed"), "of shape (T, ..., n), time first and runs last, but it is of shape"),
+        (lambda: interpret(3.0, 0.9, "mixed"), "of shape (T, ..., n), time first and runs last, but it is of shape ()"),
         (lambda: interpret(np.ones((5, 0)), 0.9, "mixed"), "`values` must hold numbers of shape (T, ..., n)"),
         (lambda: interpret(np.ones((5, 2)), 0.9, "worst"), "`how` must be one of ensemble, temporal, mixed, but it is 'worst'"),
         (lambda: interpret(np.ones((5, 2)), 99.73, "mixed"), "`level` must lie in (0, 1)"),

@@ -32,7 +32,8 @@ class Rate(NamedTuple):
 
 def rate_of(successes: int, trials: int, level: float = 0.95) -> Rate:
     """The share of successes in trials, with `jaxatt.evaluation.interval` at the confidence ``level``."""
-    return Rate(int(successes), int(trials), *interval(successes, trials, level))
+    low, high = interval(successes, trials, level)
+    return Rate(int(successes), int(trials), low, high)
 
 
 def narrowed(counts: Iterable[int], looks, half_width: float, level: float = 0.95) -> Rate:
