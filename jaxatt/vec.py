@@ -244,6 +244,54 @@ def largest_eigenvalue(m: Mat3):
     return mean + 2 * p * _cos_third(jnp.clip(det(a) / 2, -1, 1))
 
 
+def largest_eigenvector(K) -> tuple[Any, Quat]:
+    """Largest eigenvalue of a symmetric 4x4 matrix, and its unit eigenvector, w >= 0, which is often an attitude.
+
+    K: four rows, each a `Quat`. Newton's method on det(K - x I) = 0 from a bound above all eigenvalues; there
+    adj(K - x I) is a multiple of v v', whose longest column, multiplied by it once more, is v. Where the largest
+    eigenvalue is a double one, no vector is singled out: NaN.
+    """
+    size = safe_sqrt(sum(row @ row for row in K))
+    rows = [[a / jnp.where(size > 0, size, 1) for a in row] for row in K]
+    mean = (rows[0][0] + rows[1][1] + rows[2][2] + rows[3][3]) / 4
+    square = sum(a * a for row in rows for a in row) / 4
+    above = mean + safe_sqrt(3 * jnp.maximum(square - mean * mean, 0))  # Wolkowicz and Styan, 1980
+
+    def newton(_, x):
+        determinant, adjugate = _adjugate(rows, x)
+        slope = sum(adjugate[i][i] for i in range(4))
+        return x + jnp.where(slope < 0, determinant / jnp.where(slope < 0, slope, 1), 0)
+
+    x = jax.lax.fori_loop(0, 20, newton, jnp.asarray(above, jnp.result_type(float, above)))
+    columns = _adjugate(rows, x)[1]
+    longest, length = columns[0], jnp.abs(columns[0].w)
+    for i in (1, 2, 3):
+        longer = jnp.abs(columns[i][i]) > length
+        longest, length = where(longer, columns[i], longest), jnp.where(longer, jnp.abs(columns[i][i]), length)
+    longest = longest / jnp.sqrt(longest @ longest)
+    v = Quat(*(column @ longest for column in columns))
+    length, trace = jnp.sqrt(v @ v), sum(columns[i][i] for i in range(4))  # equal if the adjugate has rank one
+    single = length > 0.75 * jnp.abs(trace)
+    return size * x, v * jnp.where(single, jnp.where(v.w < 0, -1, 1) / length, jnp.nan)
+
+
+def _adjugate(rows, x):
+    """Determinant and adjugate, four `Quat`, of K - x I for a symmetric K, by the minors of its upper and lower half."""
+    (a, b, c, d), (_, e, f, g), (_, _, h, i), (_, _, _, j) = rows
+    a, e, h, j = a - x, e - x, h - x, j - x
+    s0, s1, s2, s3, s4, s5 = a * e - b * b, a * f - b * c, a * g - b * d, b * f - e * c, b * g - e * d, c * g - f * d
+    t0, t1, t2, t3, t4, t5 = c * g - d * f, c * i - d * h, c * j - d * i, f * i - g * h, f * j - g * i, h * j - i * i
+    upper = {
+        (0, 0): e * t5 - f * t4 + g * t3, (0, 1): -b * t5 + c * t4 - d * t3, (0, 2): g * s5 - i * s4 + j * s3,
+        (0, 3): -f * s5 + h * s4 - i * s3, (1, 1): a * t5 - c * t2 + d * t1, (1, 2): -d * s5 + i * s2 - j * s1,
+        (1, 3): c * s5 - h * s2 + i * s1, (2, 2): d * s4 - g * s2 + j * s0, (2, 3): -c * s4 + f * s2 - i * s0,
+        (3, 3): c * s3 - f * s1 + h * s0,
+    }  # fmt: skip
+    entry = lambda m, n: upper[min(m, n), max(m, n)]
+    determinant = s0 * t5 - s1 * t4 + s2 * t3 + s3 * t2 - s4 * t1 + s5 * t0
+    return determinant, [Quat(*(entry(m, n) for n in range(4))) for m in range(4)]
+
+
 def norm(v):
     """Euclidean length of a `Vec3` or `Quat`; its gradient at zero is zero, not NaN."""
     return safe_sqrt(v @ v)

@@ -1,5 +1,6 @@
 """Laws of the attitude algebra, on random attitudes and at the edges of every set of coordinates."""
 
+from itertools import product
 from typing import Any
 
 import jax
@@ -11,10 +12,16 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from jaxatt.attitude import (
+    angles_from_quat,
     euler_body_rate,
+    euler_from_matrix,
     euler_from_quat,
     euler_rate,
+    full_turn,
+    left_jacobian,
+    left_jacobian_inverse,
     mrp_error,
+    mrp_from_matrix,
     mrp_from_quat,
     mrp_inner,
     mrp_matrix,
@@ -22,19 +29,27 @@ from jaxatt.attitude import (
     mrp_product,
     mrp_rate,
     mrp_rate_transposed,
+    nearest_rotation,
     quat_angle,
     quat_conjugate,
     quat_error,
+    quat_from_angles,
     quat_from_euler,
+    quat_from_matrix,
     quat_from_mrp,
+    quat_from_scalar_last,
     quat_from_vector,
     quat_matrix,
+    quat_mean,
     quat_normalised,
     quat_rate,
     quat_rotate,
     quat_to_body,
+    scalar_last_from_quat,
+    vector_from_quat,
+    wrapped,
 )
-from jaxatt.vec import Quat, Vec3, array, cross, norm, zeros
+from jaxatt.vec import Mat3, Quat, Vec3, array, cross, norm, zeros
 
 RNG = np.random.default_rng(2)
 N = 50
@@ -60,30 +75,49 @@ def shadow(q):
     return -q / np.where(q @ q > 0, q @ q, -1)
 
 
-def rotation_vector(p):
-    return Vec3.of(Rotation.from_quat(np.roll(array(p), -1, axis=0).T).as_rotvec().T)
+SEQUENCES = ["".join(name) for name in product("123", repeat=3) if name[0] != name[1] != name[2]]
+COORDINATES = {
+    "MRP": (mrp_from_quat, quat_from_mrp),
+    "shadow": (lambda p: shadow(mrp_from_quat(p)), quat_from_mrp),
+    "quaternion": (lambda p: p, quat_normalised),
+    "opposite quaternion": (lambda p: -p, quat_normalised),
+    "quaternion of three digits": (lambda p: 32.767 * p, quat_normalised),
+    "scalar last": (scalar_last_from_quat, quat_from_scalar_last),
+    "Euler angles": (euler_from_quat, quat_from_euler),
+    "rotation vector": (vector_from_quat, quat_from_vector),
+    "matrix": (quat_matrix, quat_from_matrix),
+    "MRP of a matrix": (lambda p: mrp_from_matrix(quat_matrix(p)), quat_from_mrp),
+    "Euler angles of a matrix": (lambda p: euler_from_matrix(quat_matrix(p)), quat_from_euler),
+} | {
+    name: (lambda p, name=name: angles_from_quat(p, name), lambda a, name=name: quat_from_angles(a, name))
+    for name in SEQUENCES
+}  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("there", "back"),
-    [
-        (mrp_from_quat, quat_from_mrp),
-        (lambda p: shadow(mrp_from_quat(p)), quat_from_mrp),
-        (lambda p: p, quat_normalised),
-        (lambda p: -p, quat_normalised),
-        (euler_from_quat, quat_from_euler),
-        (rotation_vector, quat_from_vector),
-    ],
-    ids=["MRP", "shadow", "quaternion", "opposite quaternion", "Euler angles", "rotation vector"],
-)
-def test_coordinates_give_back_the_rotation_near_0_90_180_and_360_deg(there, back):
+@pytest.mark.parametrize("name", COORDINATES)
+def test_coordinates_give_back_the_rotation_near_0_90_180_and_360_deg(name):
+    there, back = COORDINATES[name]
     matrices = np.moveaxis(TURNS.as_matrix(), 0, -1)
     np.testing.assert_allclose(array(quat_matrix(QUATERNIONS)), matrices, atol=1e-15)
     again = back(there(QUATERNIONS))
-    # at 90 deg about y the angles about x and z are one, and half of the digits are lost
-    tolerance = np.where((back is quat_from_euler) & (np.abs(matrices[2, 0]) > 1 - 1e-12), 3e-8, 1e-14)
-    assert (np.abs(array(quat_matrix(again)) - matrices) <= tolerance).all()
-    assert (np.abs(quat_angle(again) - TURNS.magnitude()) <= tolerance).all()
+    np.testing.assert_allclose(array(quat_matrix(again)), matrices, atol=2e-15)
+    np.testing.assert_allclose(quat_angle(again), TURNS.magnitude(), atol=2e-15)
+    single = back(there(jax.tree.map(jnp.float32, QUATERNIONS)))
+    assert all(a.dtype == jnp.float32 for a in jax.tree.leaves(single))
+    np.testing.assert_allclose(array(quat_matrix(single)), matrices, atol=2e-6)
+
+
+@pytest.mark.parametrize("name", [name for name in COORDINATES if name != "shadow"])  # which is at infinity
+def test_gradients_of_conversions_are_finite_at_their_singularities(name):
+    """At no turn, at half a turn and just before it, at gimbal lock."""
+    there, back = COORDINATES[name]
+    turn = lambda r, p: back(there(p * quat_from_vector(r)))
+    slope = jax.jit(jax.vmap(lambda p: jax.jacfwd(turn)(zeros(), p)))
+    quarter = np.sqrt(0.5)
+    edges = [(1, 0, 0, 0), (5e-7, 1, 0, 0), (5e-7, 0, 1, 0), (5e-7, 2 / 7, -3 / 7, 6 / 7), (0, 1, 0, 0)]
+    edges += [(quarter, *(sign * quarter * np.eye(3)[i])) for sign in (1, -1) for i in range(3)]
+    found = slope(Quat.of(np.array(edges).T))
+    assert all(np.isfinite(a).all() for a in jax.tree.leaves(found))
 
 
 def test_mrp_matrix_and_inner_representative_near_0_90_180_and_360_deg():
@@ -172,6 +206,7 @@ def test_quaternions_agree_with_scipy():
     P, Q = Rotation.from_rotvec(np.array(array(r)).T), Rotation.from_rotvec(np.array(array(s)).T)
     np.testing.assert_allclose(jnp.moveaxis(array(quat_matrix(p)), -1, 0), P.as_matrix(), atol=1e-12)
     np.testing.assert_allclose(jnp.moveaxis(array(quat_matrix(p * q)), -1, 0), (P * Q).as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(array(vector_from_quat(p)).T, P.as_rotvec(), atol=2e-15)
     np.testing.assert_allclose(array(quat_rotate(p, v)).T, P.apply(np.array(array(v)).T), atol=1e-12)
     np.testing.assert_allclose(quat_angle(quat_error(p, q)), (Q.inv() * P).magnitude(), atol=1e-7)
     np.testing.assert_allclose(array(mrp_from_quat(p)).T, P.as_mrp(), atol=1e-12)
@@ -197,6 +232,194 @@ def test_euler_angles_agree_with_scipy_and_with_their_rate():
     close(euler_body_rate(a, euler_rate(a, w)), w)
     rate = jax.jvp(quat_from_euler, (a,), (euler_rate(a, w),))[1]
     close(rate, quat_rate(q, w))
+
+
+def turned(n, seed):
+    """Random rotations, evenly distributed."""
+    return Rotation.from_quat(np.random.default_rng(seed).normal(size=(n, 4)))
+
+
+# gimbal lock
+
+
+def apart(p, turns):
+    """The largest turn [rad] between quaternions and SciPy's rotations."""
+    return (Rotation.from_quat(np.asarray(array(p), float).T, scalar_first=True).inv() * turns).magnitude().max()
+
+
+def scipys(name):
+    return name.translate(str.maketrans("123", "XYZ"))
+
+
+@pytest.mark.parametrize("name", SEQUENCES)
+def test_all_sequences_agree_with_scipy(name):
+    turns = turned(300, 3)
+    a = angles_from_quat(quat_from_scalar_last(turns.as_quat().T), name)
+    expected = turns.as_euler(scipys(name))
+    assert (np.abs(np.sin(expected[:, 1])) > 1e-3).all() or name[0] != name[2]
+    np.testing.assert_allclose(wrapped(array(a).T - expected), 0, atol=1e-12)
+    assert apart(quat_from_angles(Vec3.of(expected.T), name), turns) < 2e-15
+
+
+@pytest.mark.parametrize("kind", [np.float64, np.float32])
+@pytest.mark.parametrize("name", SEQUENCES)
+def test_the_attitude_survives_gimbal_lock(name, kind):
+    rng = np.random.default_rng(5)
+    locks = (0, np.pi) if name[0] == name[2] else (np.pi / 2, -np.pi / 2)
+    tolerance = 10 * np.finfo(kind).eps
+    for lock, offset in product(locks, [0, 1e-12, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2]):
+        second = lock - np.sign(lock or -1) * offset
+        angles = np.stack([rng.uniform(-np.pi, np.pi, 100), np.full(100, second), rng.uniform(-np.pi, np.pi, 100)], 1)
+        turns = Rotation.from_euler(scipys(name), angles)
+        a = angles_from_quat(quat_from_scalar_last(turns.as_quat().T.astype(kind)), name)
+        assert apart(quat_from_angles(a, name), turns) < tolerance
+        assert (np.abs(array(a)) <= np.pi * (1 + np.finfo(kind).eps)).all()
+        if not offset:
+            assert (np.asarray(a.z) == 0).mean() > 0.9  # rounding of the quaternion may be an offset
+
+
+def test_at_90_deg_of_pitch_yaw_takes_the_sum_and_roll_is_zero():
+    for sign in (1, -1):
+        a = euler_from_quat(quat_from_euler(Vec3(0.3, sign * np.pi / 2, 0.5)))
+        close(a, Vec3(0.0, sign * np.pi / 2, 0.5 - sign * 0.3), 1e-15)
+
+
+@pytest.mark.parametrize("wrong", ["", "32", "3211", "121x", "112", "322", "zyx", "ZYX", "421", 321, None])
+def test_a_sequence_that_is_none_is_refused(wrong):
+    for refused in (
+        lambda: quat_from_angles(zeros(), wrong),
+        lambda: angles_from_quat(Quat(1.0, 0.0, 0.0, 0.0), wrong),
+    ):
+        with pytest.raises(ValueError, match=r"^`sequence` must .*'321'"):
+            refused()
+
+
+# matrices
+
+
+def matrices(turns):
+    return np.moveaxis(turns.as_matrix(), 0, -1)
+
+
+def test_matrices_of_any_trace_agree_with_scipy():
+    turns = turned(300, 4)
+    p = quat_from_matrix(Mat3.of(matrices(turns)))
+    expected = turns.as_quat(canonical=True, scalar_first=True)
+    np.testing.assert_allclose(array(p).T, expected, atol=2e-15)
+    np.testing.assert_allclose(array(mrp_from_matrix(Mat3.of(matrices(turns)))).T, turns.as_mrp(), atol=2e-15)
+    euler = array(euler_from_matrix(Mat3.of(matrices(turns))))
+    np.testing.assert_allclose(euler[::-1].T, turns.as_euler("ZYX"), atol=1e-12)
+
+
+def test_half_turns_are_exact():
+    for i in range(3):
+        half = np.diag(np.where(np.arange(3) == i, 1.0, -1.0))
+        p = quat_from_matrix(Mat3.of(half))
+        np.testing.assert_array_equal(array(p), np.append(0, np.eye(3)[i]))
+        np.testing.assert_array_equal(array(vector_from_quat(p)), np.pi * np.eye(3)[i])
+
+
+@pytest.mark.parametrize("size", [1e-6, 1e-3, 0.1])
+def test_the_nearest_rotation_is_that_of_the_svd(size):
+    rng = np.random.default_rng(6)
+    m = turned(200, 5).as_matrix() + size * rng.normal(size=(200, 3, 3))
+    U, _, V = np.linalg.svd(m)
+    for factor in (1.0, 2.0, 32767.0):  # a common scale is no rotation
+        ours = nearest_rotation(Mat3.of(factor * np.moveaxis(m, 0, -1)))
+        np.testing.assert_allclose(np.moveaxis(np.asarray(array(ours)), -1, 0), U @ V, atol=1e-14)
+    rounded = np.round(turned(50, 6).as_matrix(), 3)
+    U, _, V = np.linalg.svd(rounded)
+    p = quat_from_matrix(Mat3.of(np.moveaxis(rounded, 0, -1)))
+    assert apart(p, Rotation.from_matrix(U @ V)) < 1e-14
+
+
+def test_a_reflection_is_refused_and_in_a_program_it_is_nan():
+    for m in (-np.eye(3), np.diag([1.0, 1.0, -1.0]), np.zeros((3, 3))):
+        for f in (nearest_rotation, quat_from_matrix, mrp_from_matrix, euler_from_matrix):
+            with pytest.raises(ValueError, match=r"^`det\(m\)` must be 1 .* but it is -?[01]\.$"):
+                f(Mat3.of(m))
+        assert np.isnan(array(jax.jit(quat_from_matrix)(Mat3.of(m)))).all()
+    gap = np.where(np.arange(2) == 0, np.nan, np.eye(3)[..., None])  # a missing row of a log
+    np.testing.assert_array_equal(array(quat_from_matrix(Mat3.of(gap))).T, [[np.nan] * 4, [1, 0, 0, 0]])
+
+
+# rotation vectors
+
+
+def test_the_rotation_vector_keeps_its_digits_near_zero():
+    for size in (0.0, 1e-300, 1e-12, 1e-8, 1.9e-4, 2.1e-4, 1e-2):
+        r = Vec3(size * 2 / 7, -size * 3 / 7, size * 6 / 7)
+        close(vector_from_quat(quat_from_vector(r)), r, 1e-15 * max(size, 1e-300))
+    for factor in (-1.0, 3.0):  # the opposite quaternion, and one of another length
+        close(vector_from_quat(factor * quat_from_vector(Vec3(0.3, -0.2, 0.1))), Vec3(0.3, -0.2, 0.1), 1e-15)
+    assert np.isnan(array(vector_from_quat(Quat(0.0, 0.0, 0.0, 0.0)))).all()
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-9, 0.0099, 0.0101, 1.0, np.pi, 6.0])
+def test_the_left_jacobian_is_the_derivative_of_the_rotation(size):
+    r = Vec3(size * 2 / 7, -size * 3 / 7, size * 6 / 7)
+    p, J, inverse = quat_from_vector(r), left_jacobian(r), left_jacobian_inverse(r)
+    for d in map(Vec3.of, np.eye(3)):
+        _, rate = jax.jvp(quat_from_vector, (r,), (d,))
+        close(rate, 0.5 * (Quat(0.0, *(J @ d)) * p), 1e-13)
+        close(rate, 0.5 * (p * Quat(0.0, *(J.T @ d))), 1e-13)  # in body axes
+    close(J @ inverse, Mat3.of(np.eye(3)), 1e-12)
+    a = np.array(array(r))
+    S = np.array([[0, -a[2], a[1]], [a[2], 0, -a[0]], [-a[1], a[0], 0]])
+    series, term = np.eye(3), np.eye(3)
+    for n in range(2, 60):  # J = sum of S^(n - 1) / n!
+        term = term @ S / n
+        series = series + term
+    np.testing.assert_allclose(array(J), series, atol=1e-13)
+    for f in (left_jacobian, left_jacobian_inverse):
+        assert all(np.isfinite(g) for g in jax.tree.leaves(jax.jacfwd(f)(r)))
+
+
+# means, angles
+
+
+def test_the_mean_attitude_is_the_eigenvector_whatever_the_signs():
+    rng = np.random.default_rng(7)
+    turns = Rotation.from_rotvec([0.3, 2.0, -1.5]) * Rotation.from_rotvec(0.2 * rng.normal(size=(20, 3)))
+    q = turns.as_quat(scalar_first=True) * rng.choice([-1, 1], 20)[:, None]
+    mean_of = jax.jit(lambda q, weights: quat_mean(Quat.of(q.T), weights))
+    for weights in (np.ones(20), rng.uniform(0, 5, 20)):
+        mean = mean_of(q, weights)
+        best = np.linalg.eigh((q.T * weights) @ q)[1][:, -1]
+        np.testing.assert_allclose(array(mean), best * np.sign(best[0]), atol=2e-15)
+        assert apart(jax.tree.map(lambda a: a[None], mean), turns.mean(weights)) < 1e-14
+    close(mean_of(0.999 * q, np.ones(20)), mean_of(q, np.ones(20)), 1e-15)
+    same = np.repeat(q[:1], 20, axis=0)
+    close(mean_of(same, np.full(20, 0.3)), Quat.of(q[0] * np.sign(q[0][0])), 1e-15)
+    slope = jax.jit(lambda q: jax.jvp(lambda s: quat_mean(Quat.of(q.T), s), (np.ones(20),), (np.arange(20.0),))[1])
+    for at in (q, same):
+        assert all(np.isfinite(a).all() for a in jax.tree.leaves(slope(at)))
+    apart_by_half_a_turn = np.repeat([[1.0, 0, 0, 0], [0, 1.0, 0, 0]], 10, axis=0)
+    assert np.isnan(array(mean_of(apart_by_half_a_turn, np.ones(20)))).all()
+
+
+def test_conversions_take_quaternions_of_any_length():
+    turns = turned(50, 8)
+    p = quat_from_scalar_last(turns.as_quat().T)
+    for f in (quat_matrix, mrp_from_quat, vector_from_quat, euler_from_quat, lambda p: angles_from_quat(p, "313")):
+        for factor in (0.9995, 32767.0):
+            close(f(factor * p), f(p), 1e-13)
+        assert np.isnan(array(f(0 * p))).all()
+
+
+def test_scalar_last_is_another_order_and_no_quaternion_is_taken_for_it():
+    np.testing.assert_array_equal(array(quat_from_scalar_last([1, 2, 3, 4])), [4, 1, 2, 3])
+    np.testing.assert_array_equal(scalar_last_from_quat(Quat(4, 1, 2, 3)), [1, 2, 3, 4])
+    with pytest.raises(TypeError, match="`a` must be an array with the rows x, y, z, w, but it is a Quat"):
+        quat_from_scalar_last(Quat(1.0, 0.0, 0.0, 0.0))
+
+
+def test_angles_are_wrapped_by_the_turn_of_their_unit():
+    assert [full_turn(unit) for unit in ("rad", "deg", "rad/s", "m")] == [2 * np.pi, 360, np.inf, np.inf]
+    np.testing.assert_array_equal(wrapped(np.array([359.0, -359, 180.5, 0, 719]), 360.0), [-1, 1, -179.5, 0, -1])
+    np.testing.assert_allclose(wrapped(np.array([6.0, -3.0, 2e3 * np.pi])), [6 - 2 * np.pi, -3, 0], atol=1e-12)
+    np.testing.assert_array_equal(wrapped(np.array([359.0, 7.0]), np.array([np.inf, 2.0])), [359, -1])
+    assert jax.grad(wrapped)(3.5) == 1 and jax.grad(wrapped)(400.0, np.inf) == 1
 
 
 @pytest.mark.slow

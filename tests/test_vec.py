@@ -6,7 +6,20 @@ import numpy as np
 import pytest
 
 from jaxatt import vec
-from jaxatt.vec import Mat3, Quat, Vec3, array, cross, det, diagonal, inverse, largest, largest_eigenvalue, norm
+from jaxatt.vec import (
+    Mat3,
+    Quat,
+    Vec3,
+    array,
+    cross,
+    det,
+    diagonal,
+    inverse,
+    largest,
+    largest_eigenvalue,
+    largest_eigenvector,
+    norm,
+)
 
 RNG = np.random.default_rng(0)
 
@@ -191,3 +204,35 @@ def test_the_gradient_of_the_largest_eigenvalue_is_the_central_difference():
 def test_the_largest_eigenvalue_in_float32():
     m = symmetric([1e-12, 2e-12, 3e-12]).astype(np.float32)  # p^3 alone would underflow
     assert largest_eigenvalue(Mat3.of(m)) == pytest.approx(3e-12, rel=1e-6)
+
+
+def test_the_largest_eigenvector_of_four_by_four_is_that_of_lapack():
+    """To rounding over the gap to the next eigenvalue, matrices of attitude (trace 0) and of one rank among them."""
+    rng = np.random.default_rng(9)
+    many = rng.normal(size=(400, 4, 4))
+    many += np.swapaxes(many, 1, 2)
+    many[100:200] -= np.trace(many[100:200], axis1=1, axis2=2)[:, None, None] / 4 * np.eye(4)
+    ones = rng.normal(size=(100, 4))
+    many[200:300] = ones[:, :, None] * ones[:, None, :]
+    values, vectors = np.linalg.eigh(many)
+    size, gap = np.abs(values).max(1), values[:, -1] - values[:, -2]
+    best = vectors[:, :, -1] * np.sign(vectors[:, :1, -1])
+    run = jax.jit(largest_eigenvector)
+    for kind, rounding in ((np.float64, 1e-14), (np.float32, 5e-6)):
+        value, v = run(tuple(Quat.of(row) for row in np.moveaxis(many, 0, -1).astype(kind)))
+        assert (np.abs(value - values[:, -1]) <= rounding * size).all()
+        clear = (np.abs(best[:, 0]) > 1e-3) & (gap > 0.1 * size)  # else the sign of w is a matter of rounding
+        assert clear.sum() > 300 and (np.abs(array(v).T - best).max(1) <= rounding * size / gap)[clear].all()
+    pair = run(tuple(map(Quat.of, np.diag([1.0, 1.0, 0.5, 0.0]))))[1]
+    assert np.isnan(array(pair)).all()
+
+
+def test_the_largest_eigenvector_has_the_gradient_of_differences():
+    K = np.random.default_rng(10).normal(size=(4, 4))
+    K = K + K.T
+    D = np.outer([1.0, -2.0, 0.5, 0.3], [1.0, -2.0, 0.5, 0.3])
+    along = lambda s: largest_eigenvector(tuple(map(Quat.of, jnp.asarray(K) + s * jnp.asarray(D))))
+    run = jax.jit(lambda s: jax.jvp(along, (s,), (1.0,)))
+    slope = jax.tree.map(lambda a, b: (a - b) / 2e-6, run(1e-6)[0], run(-1e-6)[0])
+    for a, b in zip(jax.tree.leaves(run(0.0)[1]), jax.tree.leaves(slope)):
+        np.testing.assert_allclose(a, b, rtol=1e-7, atol=1e-8)
