@@ -10,9 +10,10 @@ from matplotlib.patches import Circle
 from experiments.report import Report, interval
 from jaxatt import plot, simulate, sweep, varied
 from jaxatt import singularity as sg
-from jaxatt.cmg import Steering, cmg_triads, condition, modules
+from jaxatt.cmg import Steering, cmg_triads, modules
 from jaxatt.loops import cmg_loss as cmg
 from jaxatt.plot import COLOURS, LINES, MARKS
+from jaxatt.torque_matrix import condition
 from jaxatt.vec import Vec3, array
 
 KEY = jax.random.key(0)

@@ -1,17 +1,14 @@
 """Control moment gyros (CMG): mounting, motion of a spacecraft with a cluster, torque matrix, steering laws.
 
-The torque matrix T = [t_1 ... t_n] of n modules is a `Vec3` whose components are its rows, shape (n,); the cluster is
-singular where rank T < 3. All algebra on T is in closed form, without decompositions. Axes behind the modules' are
-grid points. Source: Jin & Leeghim (2021); docs/loops/cmg_loss.md.
+The torque matrix T = [t_1 ... t_n] of n modules is a `Vec3` whose components are its rows, shape (n,), and what it can
+do is told by `torque_matrix`; the cluster is singular where rank T < 3. Axes behind the modules' are grid points.
+Source: Jin & Leeghim (2021); docs/loops/cmg_loss.md.
 
-May import: check, vec, compiling.
+May import: check, vec, compiling, torque_matrix.
 """
 
 from __future__ import annotations
 
-from functools import reduce
-from itertools import combinations
-from operator import add
 from typing import Annotated, Any, NamedTuple
 
 import jax
@@ -21,7 +18,8 @@ import numpy as np
 from jaxatt import check
 from jaxatt.check import not_negative, positive
 from jaxatt.compiling import shared
-from jaxatt.vec import Mat3, Vec3, cross, diagonal, inverse, largest_eigenvalue, norm, safe_sqrt, where
+from jaxatt.torque_matrix import dyads, gram_determinant, min_norm_solve, ordered_minors, robust_solve, times
+from jaxatt.vec import Mat3, Vec3, cross, diagonal, inverse, where
 
 # mounting
 
@@ -154,151 +152,9 @@ def cmg_motion(w: Vec3, rate, spin, at: Triads, J: Mat3, m: ModuleInertia, servo
     return CmgMotion(w_change, change - free * (at.r @ w_change), spin_change)
 
 
-# the torque matrix
-
-
-def columns(v: Vec3) -> list[Vec3]:
-    """The n vectors of a `Vec3` of shape (n,)."""
-    return [Vec3(*components) for components in zip(*v)]
-
-
-def times(v: Vec3, x) -> Vec3:
-    """sum x_i v_i, that is T x for x of shape (n,); T' a for a vector a is t @ a."""
-    return Vec3(*(_sum(row * x) for row in v))
-
-
-def dyads(v: Vec3, weight) -> Mat3:
-    """sum weight_i v_i v_i', a symmetric matrix; weight: () or (n,)."""
-    return _symmetric(lambda a, b: _sum(weight * a * b), v)
-
-
 def _once(tree):
     """The tree, computed once for all that use it (see `shared`)."""
     return shared(lambda a: a, tree)
-
-
-def _sum(a):
-    """Sum over the modules, written out: over the array's axis it compiles to code several times slower."""
-    return reduce(add, a)
-
-
-def _symmetric(entry, v: Vec3) -> Mat3:
-    xy, xz, yz = entry(v.x, v.y), entry(v.x, v.z), entry(v.y, v.z)
-    return Mat3(Vec3(entry(v.x, v.x), xy, xz), Vec3(xy, entry(v.y, v.y), yz), Vec3(xz, yz, entry(v.z, v.z)))
-
-
-def gram(t: Vec3) -> Mat3:
-    """T T'."""
-    return dyads(t, 1)
-
-
-def minors(t: list[Vec3]) -> dict[tuple[int, int, int], Any]:
-    """det [t_i t_j t_k] of the columns i < j < k."""
-    return {(i, j, k): t[i] @ cross(t[j], t[k]) for i, j, k in combinations(range(len(t)), 3)}
-
-
-class _Minors(NamedTuple):
-    """Minors of T of order two and three, twice and six times over."""
-
-    pairs: Vec3  # (n, n) t_j x t_k
-    triples: Any  # (n, n, n) det [t_i t_j t_k]
-
-
-def _minors(t: Vec3) -> _Minors:
-    pairs = cross(Vec3(*(c[:, None] for c in t)), t)
-    return _Minors(pairs, Vec3(*(c[:, None, None] for c in t)) @ pairs)
-
-
-def gram_determinant(t: Vec3):
-    """det(T T') = (sigma_1 sigma_2 sigma_3)^2 as the sum of the squared minors (Cauchy-Binet): never cancels."""
-    triples = _minors(t).triples
-    return jnp.sum(triples * triples, axis=(0, 1, 2)) / 6
-
-
-def squared_singular_values(t: list[Vec3], once=lambda f, *operands: f(*operands)):
-    """sigma_1^2 >= sigma_2^2 >= sigma_3^2 >= 0 of the columns t; once: `shared`, where a loop needs several of them.
-
-    The eigenvalues of T T', but none by a subtraction: the small ones come from their sum and product (Vieta), those
-    from the squared minors of T of order two and three (docs/loops/cmg_loss.md, choice 3).
-    """
-    A, areas, volumes = once(_invariants, t)
-    return _roots(once(largest_eigenvalue, A), areas, volumes)
-
-
-def _invariants(t: list[Vec3]):
-    """T T', and the sums of the squared minors of T of order two and three: l1 l2 + l1 l3 + l2 l3 and l1 l2 l3."""
-    A = _symmetric(lambda a, b: sum(x * y for x, y in zip(a, b)), Vec3(*zip(*t)))
-    areas = sum(c @ c for c in (cross(a, b) for a, b in combinations(t, 2)))
-    return A, areas, sum(d * d for d in minors(t).values())
-
-
-def _roots(l1, areas, volumes):
-    """Eigenvalues l1 >= l2 >= l3 of T T' from the largest and the sums of the squared minors of order two and three."""
-    by = 1 / _not_zero(l1)
-    product = volumes * by  # l2 l3
-    both = jnp.maximum(areas - product, 0) * by  # l2 + l3
-    divisor = both + safe_sqrt(jnp.maximum(both * both - 4 * product, 0))
-    l3 = jnp.minimum(2 * product / _not_zero(divisor), both / 2)
-    return l1, both - l3, l3
-
-
-def singular_values(t: Vec3) -> Vec3:
-    """Singular values of T, largest first, each as exact as T."""
-    return Vec3(*(safe_sqrt(a) for a in squared_singular_values(columns(t), shared)))
-
-
-def condition(t: Vec3):
-    """Condition number sigma_1 / sigma_3 of T, eq. (3); inf where rank T < 3."""
-    return condition_and_rank(t)[0]
-
-
-def condition_and_rank(t: Vec3):
-    """`condition`, and whether sigma_2 < 1e-6 sigma_1: T of rank one, from which no gimbal motion helps at first."""
-    sigma = singular_values(t)
-    singular = sigma.z <= 0
-    return jnp.where(singular, jnp.inf, sigma.x / jnp.where(singular, 1, sigma.z)), sigma.y < 1e-6 * sigma.x
-
-
-# solving T x = a
-
-
-def min_norm_solve(t: Vec3, a: Vec3, rcond):
-    """The pseudo-inverse of T times a, (n,): of all least-squares solutions the shortest.
-
-    Singular values below rcond sigma_1 count as zero. The solution is the mean of the solutions by Cramer's rule of all
-    triples of columns, at rank two of all pairs in the plane at right angles to the direction u of sigma_3, weighted by
-    their squared determinants: as exact as T itself, where (T T')^-1 would square the condition.
-    """
-    A, (pairs, triples), one = _once(gram(t)), _minors(t), diagonal((1.0, 1.0, 1.0))
-    areas, volumes = jnp.sum(pairs @ pairs) / 2, jnp.sum(triples * triples) / 6
-    l1, l2, l3 = shared(_roots, shared(largest_eigenvalue, A), areas, volumes)
-    three = jnp.sum(triples * (pairs @ a), axis=(1, 2)) / _not_zero(2 * volumes)
-
-    adjugate = _symmetric(lambda p, q: jnp.sum(p * q) / 2, pairs)
-    u = _longest(adjugate - l3 * ((A.x.x + A.y.y + A.z.z) * one - A) + l3 * l3 * one)  # adjugate of A - l3
-    seen = pairs @ u
-    two = jnp.sum(seen * (cross(a, t) @ u), axis=1) / _not_zero(jnp.sum(seen * seen) / 2)
-
-    v = _longest(A @ A - (l2 + l3) * A + l2 * l3 * one)  # direction of sigma_1: (A - l2) (A - l3)
-    single = (t @ v) * ((v @ a) / _not_zero(l1))
-    least = rcond * rcond * l1
-    return jnp.where(l3 > least, three, jnp.where(l2 > least, two, single))
-
-
-def robust_solve(t: Vec3, a: Vec3, E: Mat3):
-    """T' (T T' + E)^-1 a, (n,): the singularity-robust inverse with damping E."""
-    return t @ (inverse(gram(t) + E) @ a)
-
-
-def _not_zero(a):
-    return jnp.where(a > 0, a, 1)
-
-
-def _longest(m: Mat3) -> Vec3:
-    """The longest row of a matrix, of length one; zero if all are zero."""
-    xx, yy, zz = (row @ row for row in m)
-    v = where((xx >= yy) & (xx >= zz), m.x, where(yy >= zz, m.y, m.z))
-    return v / _not_zero(norm(v))
 
 
 # steering
@@ -328,7 +184,7 @@ def steer(law: Steering, a: Vec3, axes: GimbalAxes, gamma, healthy, t):
     """
     at = cmg_triads(axes, gamma)
     T, s = healthy * at.t, healthy * at.s
-    pairs, triples = _minors(T)
+    pairs, triples = ordered_minors(T)
     turned = Vec3(*(c[:, None, None] for c in s)) @ pairs  # less the change of the minors with gamma_i, dt/dgamma = -s
     up = -law.null * jnp.sum(triples * turned, axis=(1, 2))  # law.null grad det(T T')
     to_do = a - times(T, up)  # so that up moves the gimbals, but not the momentum

@@ -6,7 +6,7 @@ points and directions lie in an axis behind that of the modules. Momenta are in 
 what are no axes and ValueError for axes that are no unit vectors at right angles; those of rank and condition refuse fewer
 than three modules and parallel ones too. Source: Jin & Leeghim (2021), section 3; docs/loops/cmg_loss.md.
 
-May import: check, fields, vec, cmg.
+May import: check, fields, vec, torque_matrix, cmg.
 """
 
 from __future__ import annotations
@@ -21,8 +21,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxatt import check, fields
-from jaxatt.cmg import GimbalAxes, check_cluster, cmg_triads, columns, condition, minors, squared_singular_values
-from jaxatt.vec import Vec3, cross, norm, safe_sqrt
+from jaxatt.cmg import GimbalAxes, check_cluster, cmg_triads
+from jaxatt.torque_matrix import condition, minors, squared_singular_values
+from jaxatt.vec import Vec3, columns, cross, norm, safe_sqrt
 
 
 def _modules(axes: GimbalAxes) -> int:

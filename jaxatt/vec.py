@@ -303,13 +303,19 @@ def safe_sqrt(a):
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, a, 1)), a)
 
 
-def _columns(axes) -> list[Vec3]:
-    """Axes as vectors: of a tuple or list of `Vec3`, or of an array (3, n); TypeError or ValueError for the rest."""
-    if isinstance(axes, (tuple, list)):
-        if all(isinstance(a, Vec3) for a in axes):
+def columns(axes) -> list[Vec3]:
+    """The n axes, `Vec3`, of a tuple or list of them, of one `Vec3` of shape (n,) or of an array (3, n).
+
+    Raises TypeError or ValueError for anything else, a `Mat3` included, whose rows nobody could tell from its columns.
+    """
+    if isinstance(axes, Vec3):
+        if min(map(jnp.ndim, axes)) > 0:
+            return [Vec3(*axis) for axis in zip(*axes, strict=True)]
+    elif isinstance(axes, (tuple, list)) and not isinstance(axes, Mat3):
+        if axes and all(isinstance(a, Vec3) for a in axes):
             return list(axes)
     elif hasattr(axes, "shape"):
-        if axes.ndim != 2 or axes.shape[0] != 3:
+        if axes.ndim != 2 or axes.shape[0] != 3 or not axes.shape[1]:
             raise ValueError(f"`axes` must have shape (3, n), but it is of shape {axes.shape}.")
         return [Vec3(*axis) for axis in axes.T]
     raise TypeError(f"`axes` must be Vec3, one for each axis, or an array (3, n), but it is {type(axes).__name__}.")
@@ -320,7 +326,7 @@ def project(axes, v: Vec3):
 
     axes: a tuple of `Vec3`, or an array (3, n). Raises ValueError or TypeError for anything else.
     """
-    return jnp.stack([a @ v for a in _columns(axes)])
+    return jnp.stack([a @ v for a in columns(axes)])
 
 
 def resultant(axes, s) -> Vec3:
@@ -329,8 +335,9 @@ def resultant(axes, s) -> Vec3:
     axes: a tuple of `Vec3`, or an array (3, n). Raises ValueError or TypeError for anything else, and where s has not
     as many numbers as there are axes.
     """
-    columns = _columns(axes)
-    if len(s) != len(columns):
-        raise ValueError(f"`s` must hold a number for each of the {len(columns)} axes, but it holds {len(s)}.")
-    x, y, z = (sum(a[j] * s[i] for i, a in enumerate(columns)) for j in range(3))
+    vectors = columns(axes)
+    if jnp.ndim(s) == 0 or len(s) != len(vectors):
+        held = len(s) if jnp.ndim(s) else "one"
+        raise ValueError(f"`s` must hold a number for each of the {len(vectors)} axes, but it holds {held}.")
+    x, y, z = (sum(a[j] * s[i] for i, a in enumerate(vectors)) for j in range(3))
     return Vec3(x, y, z)

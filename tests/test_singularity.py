@@ -8,7 +8,8 @@ import numpy as np  # noqa: E402
 import pytest  # noqa: E402
 
 from jaxatt import singularity as sg  # noqa: E402
-from jaxatt.cmg import GimbalAxes, cmg_axes, cmg_triads, condition, modules  # noqa: E402
+from jaxatt.cmg import GimbalAxes, cmg_axes, cmg_triads, modules  # noqa: E402
+from jaxatt.torque_matrix import condition  # noqa: E402
 from jaxatt.vec import Vec3  # noqa: E402
 
 SKEWS = {"pyramid": 54.7, "box": 90.0}

@@ -26,12 +26,12 @@ from jaxatt.cmg import (
     cmg_axes,
     cmg_motion,
     cmg_triads,
-    condition_and_rank,
     rate_pi,
     steer,
 )
 from jaxatt.contract import System
 from jaxatt.engine import every
+from jaxatt.torque_matrix import condition_and_rank
 from jaxatt.vec import Mat3, Quat, Vec3, cross, inverse, norm, zeros
 
 DT = 0.01  # [s] logs, scores, failures
