@@ -154,6 +154,11 @@ def a_number(name: str, tree) -> None:
             each(name + jax.tree_util.keystr(path), "be a number", leaf, ~np.isnan(leaf))
 
 
+def instant(name: str, value) -> None:
+    """Refuse NaN, infinities pass; marks the field as an instant, which the engine takes as the tick's that it means."""
+    a_number(name, value)
+
+
 def moments(name: str, matrix) -> np.ndarray | None:
     """Principal moments, ascending, shape (3,) of an inertia given as three rows, first axis; None for tracers.
 

@@ -15,7 +15,7 @@ class Now(NamedTuple):
     """The present tick."""
 
     k: Any  # () [1] number of the tick, from 0
-    t: Any  # () [s] k dt
+    t: Any  # () [s] k dt, the floating number next to it (`jaxatt.clock`): ``t >= 0.3`` holds from the tick of 0.3 s on
     dt: float  # [s] to the next tick
 
 

@@ -3,7 +3,7 @@
 The functions of a `System` see one scenario. Inside the engine the scenarios of a block lie side by side in the last
 axis of everything, the lanes: `jax.vmap` with the last axis takes each function over them, a single run being one lane.
 
-May import: check, fields, contract, compiling, noise.
+May import: check, clock, fields, contract, compiling, noise.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxatt import check, fields
+from jaxatt.clock import at_tick, time_of
 from jaxatt.compiling import compiled, shared, traced, zeros
 from jaxatt.contract import Now, System
 from jaxatt.noise import CHUNK, chunk_noise, one_key
@@ -115,7 +116,7 @@ def start(system: System, params, scenario, n: int):
 def step(system: System, params, scenario, n: int, k, state, noise):
     """One tick in n lanes and the flow to the next: the instant, the state ahead and the log."""
     dtype = check.float_type((params, scenario))
-    now = Now(k, k.astype(dtype) * system.dt, system.dt)
+    now = Now(k, time_of(k, system.dt, dtype), system.dt)
 
     def tick(scenario, x, z, noise):
         out = system.tick(params, scenario, now, x, z, noise)
@@ -262,12 +263,19 @@ def tree_bytes(shapes) -> int:
     return sum(prod(a.shape) * a.dtype.itemsize for a in jax.tree.leaves(shapes))
 
 
+def prepared(system: System, params, scenario) -> tuple[Any, Any]:
+    """params and scenario as arrays of one floating type, their instants put right: see `clock.at_tick`."""
+    put = partial(at_tick, dt=system.dt)
+    params, scenario = check.converted(params, scenario)
+    return fields.instants(params, put), fields.instants(scenario, put)
+
+
 def validated(system: System, params, scenario, n: int | None = None) -> tuple[Any, Any]:
     """params and scenario converted to arrays of one floating type and, where they are concrete, checked.
 
     n: number of scenarios in the first axis of every leaf of scenario; None for a single one.
     """
-    params, scenario = check.converted(params, scenario)
+    params, scenario = prepared(system, params, scenario)
     last = scenario if n is None else jax.tree.map(_batch_last, scenario)
     fields.validate("params", params)
     with check.scenarios(n):

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxatt import check
-from jaxatt.check import a_number, flag, not_negative, positive
+from jaxatt.check import a_number, flag, instant, not_negative, positive
 from jaxatt.vec import Vec3, safe_sqrt
 
 
@@ -28,8 +28,8 @@ class Fault(NamedTuple):
     ``Fault(bias=0.1)`` is ``Fault(onset=0.0, bias=0.1)``. Fields of shape () for one channel, or (n,) for n.
     """
 
-    onset: Annotated[Any, "s", a_number] = jnp.inf  # first instant of the fault
-    end: Annotated[Any, "s", a_number] = jnp.inf  # first instant after it
+    onset: Annotated[Any, "s", instant] = jnp.inf  # first instant of the fault
+    end: Annotated[Any, "s", instant] = jnp.inf  # first instant after it
     bias: Annotated[Any, a_number] = 0.0  # [unit of the channel] constant offset
     drift: Annotated[Any, a_number] = 0.0  # [unit of the channel] incipient offset: drift (1 - exp(-(t - onset) / tau))
     tau: Annotated[Any, "s", positive] = 1.0  # time constant of the drift

@@ -6,7 +6,8 @@
 
 The first string is the unit, "1" for a pure number; a tuple is the shape of one scenario's value, () if there is none,
 several for alternatives, a name in it, ("n",), for a length that fields share; functions of (name, value), most of them
-of `jaxatt.check`, refuse what lies outside the domain. The comment holds the meaning. What no single field can say, a
+of `jaxatt.check`, refuse what lies outside the domain; `jaxatt.check.instant` marks a time at which something starts or
+ends. The comment holds the meaning. What no single field can say, a
 method ``check(name)`` of the NamedTuple refuses.
 
 From it come the refusals of `simulate` and `sweep`, the units of stores, tables and figures, and the lists of fields in
@@ -34,6 +35,7 @@ class Field(NamedTuple):
     unit: str | None  # None where it is not annotated
     shapes: tuple[tuple, ...]  # allowed shapes of one scenario's value, where they are stated
     domain: tuple[Callable, ...]  # functions (name, value) that refuse
+    instant: bool = False  # whether it is a time at which something starts or ends, `check.instant` in its domain
 
 
 @lru_cache
@@ -52,7 +54,7 @@ def _field(hint) -> Field:
     units = [note for note in notes if isinstance(note, str)]
     shapes = tuple(note for note in notes if isinstance(note, tuple))
     domain = tuple(note for note in notes if callable(note))
-    return Field(kind, units[0] if units else None, shapes, domain)
+    return Field(kind, units[0] if units else None, shapes, domain, check.instant in domain)
 
 
 def units(cls_or_tree) -> dict[str, str]:
@@ -86,6 +88,18 @@ def _names(cls) -> list[str]:
 def _dotted(path) -> str:
     text = jax.tree_util.keystr(path, simple=True, separator=".")
     return f".{text}" if text else ""
+
+
+def instants(tree, put: Callable):
+    """The tree with put(a) in place of every leaf a of the fields that are instants."""
+    if not hasattr(tree, "_fields"):
+        part = lambda node: hasattr(node, "_fields")
+        return jax.tree.map(lambda node: instants(node, put) if part(node) else node, tree, is_leaf=part)
+    parts = [
+        jax.tree.map(put, value) if known.instant else instants(value, put)
+        for known, value in zip(of(type(tree)).values(), tree)
+    ]
+    return tree._make(parts)
 
 
 def validate(name: str, tree, n: int | None = None) -> None:

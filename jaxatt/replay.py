@@ -10,7 +10,7 @@ Of the computer the scenario decides the start alone: initial estimates and the 
 moves between ticks (`observer_pd`, `wheel_mrac`), ``flow=loop.computer_flow`` and the system's ``substeps`` go along.
 `load` reads a CSV or Parquet file, which never executes code, and `resample` brings its samples to the ticks.
 
-May import: check, faults, contract, compiling, engine.
+May import: check, clock, faults, contract, compiling, engine.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxatt import check
+from jaxatt.clock import time_of
 from jaxatt.compiling import compiled
 from jaxatt.contract import Now
 from jaxatt.engine import alone, match_state, rk4
@@ -126,7 +127,7 @@ def _replay(decide, flow, dt, substeps, params, computer, readings, between):
     @jax.checkpoint
     def tick(computer, told):
         k, y, stages = told
-        now = Now(k, k.astype(dtype) * dt, dt)
+        now = Now(k, time_of(k, dt, dtype), dt)
 
         def one(computer, y):
             out = decide(params, now, computer, y)

@@ -86,7 +86,7 @@ def test_figures_and_loops_are_on_top_and_the_engine_knows_no_spacecraft():
     for name in LEAVES:
         top = {module.split(".")[0] for module in may_import(name)}
         assert "plot" not in top and ("loops" not in top or name == "plot"), name
-    kernel = {"check", "fields", "contract", "compiling", "noise"}
+    kernel = {"check", "clock", "fields", "contract", "compiling", "noise"}
     assert may_import("engine") <= kernel and may_import("sweeping") <= kernel | {"engine", "scores"}
 
 

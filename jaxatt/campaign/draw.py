@@ -18,7 +18,7 @@ from jaxatt import check, fields
 from jaxatt.campaign.store import OWN, Variable
 from jaxatt.compiling import compiled
 from jaxatt.contract import System
-from jaxatt.engine import tree_bytes, validated
+from jaxatt.engine import prepared, tree_bytes, validated
 from jaxatt.noise import BLOCK, one_key
 from jaxatt.sweeping import block_of, block_records, score_shapes, scored
 
@@ -122,7 +122,7 @@ def results(campaign: Campaign, start: int, stop: int, advance: Callable = lambd
     start: a multiple of 128. The scores are those of `sweep`, bit for bit. advance(n): n more are done.
     """
     scenarios, inputs = drawn(campaign, start, stop)
-    params, scenarios = check.converted(campaign.params, scenarios)
+    params, scenarios = prepared(campaign.system, campaign.params, scenarios)
     bad = refused(campaign.system, params, scenarios)
     values = scored(
         campaign.system, params, scenarios, campaign.key, campaign.ticks, campaign.score, start // BLOCK, advance
@@ -172,7 +172,7 @@ def variables(campaign: Campaign) -> dict[str, Variable]:
     Raises ValueError where all of the first scenarios are refused, or two arrays share a name.
     """
     scenarios, inputs = drawn(campaign, 0, BLOCK)
-    params, scenarios = check.converted(campaign.params, scenarios)
+    params, scenarios = prepared(campaign.system, campaign.params, scenarios)
     if refused(campaign.system, params, scenarios).all():
         validated(campaign.system, params, scenarios, BLOCK)
     scores = score_shapes(campaign.system, params, scenarios, campaign.key, campaign.ticks, campaign.score)

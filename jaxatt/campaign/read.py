@@ -1,6 +1,6 @@
 """Reading a store: its numbers as a labelled table, and any of its runs again.
 
-May import: check, noise, sweeping, draw, provenance, store.
+May import: check, engine, noise, sweeping, draw, provenance, store.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from jaxatt import check
 from jaxatt.campaign.draw import Campaign, checked, drawn
 from jaxatt.campaign.provenance import manifest_of, names_of, refuse_other
 from jaxatt.campaign.store import OWN, blocks_of, open_store, readable, state_of
+from jaxatt.engine import prepared
 from jaxatt.noise import BLOCK
 from jaxatt.sweeping import block_of, logged
 
@@ -91,6 +92,6 @@ def rerun(path, campaign: Campaign, index: int, *, every: int = 1, accept: Colle
         check.refuse("index", f"be less than the {n} scenarios", index)
     start = index // BLOCK * BLOCK
     scenarios, _ = drawn(campaign, start, min(start + BLOCK, n))
-    params, scenarios = check.converted(campaign.params, scenarios)
+    params, scenarios = prepared(campaign.system, campaign.params, scenarios)
     log = logged(campaign.system, params, block_of(scenarios, 0), campaign.key, index, campaign.ticks)
     return jax.tree.map(lambda a: a[::every], log)

@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxatt import check, scores
 from jaxatt.attitude import quat_normalised, quat_rate, quat_rotate
-from jaxatt.check import finite, flag, inertia, limit, not_negative, positive
+from jaxatt.check import finite, flag, inertia, instant, limit, not_negative, positive
 from jaxatt.cmg import (
     GimbalAxes,
     ModuleInertia,
@@ -62,7 +62,7 @@ class Failure(NamedTuple):
     Table 1: wheel stop: brake > 0; gimbal stuck: brake = 0; gimbal free: free = 1.
     """
 
-    onset: Annotated[Any, "s", not_negative, ("n",)]  # inf for a healthy module
+    onset: Annotated[Any, "s", not_negative, instant, ("n",)]  # inf for a healthy module
     brake: Annotated[Any, "N m s", not_negative, ("n",)]  # b_r: time constant I_ws / b_r of the wheel; 0: it spins on
     free: Annotated[Any, "1", flag, ("n",)]  # 1: the gimbal's drive lets go and the gimbal swings, 0: it holds it
     friction: Annotated[Any, "N m s", not_negative, ("n",)]  # of a free gimbal
@@ -244,7 +244,8 @@ def score(params: Params, scenario: Scenario, now, log: Log) -> Scores:
     """The tallies of one tick."""
     w, h = norm(log.w), scenario.h
     healthy = jnp.isinf(scenario.failure.onset)
-    held = jnp.sum(healthy * scenario.module.I_ws * scenario.spin * norm(cross(scenario.axes.r, h)))  # along h, by |h|
+    each = scenario.module.I_ws * scenario.spin * norm(cross(scenario.axes.r, h))  # along h, by |h|
+    held = jnp.sum(jnp.where(healthy, each, 0))
     return Scores(
         variation=scores.total(log.variation),
         jumps=scores.total(log.jumps),

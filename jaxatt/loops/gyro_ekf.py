@@ -18,7 +18,7 @@ import numpy as np
 from jaxatt import check, scores
 from jaxatt.attitude import euler_body_rate, euler_rate
 from jaxatt.bodies import body_acceleration
-from jaxatt.check import acute, finite, flag, inertia, limit, not_negative, positive, share
+from jaxatt.check import acute, finite, flag, inertia, instant, limit, not_negative, positive, share
 from jaxatt.contract import System
 from jaxatt.controllers import pid
 from jaxatt.detection import chi_square, smoothed, worst_above
@@ -64,8 +64,8 @@ class Params(NamedTuple):
     threshold: Annotated[Any, "1", limit] = np.inf  # chi-square beyond which a gyro is dropped; the paper has none
     memory: Annotated[Any, "1", positive, share] = 0.25  # share of a new innovation in the mean that is tested
     slew: Annotated[Vec3, "rad/s", finite] = zeros()  # commanded rates of the angles, from slew_start to slew_end
-    slew_start: Annotated[Any, "s", finite] = 0.0
-    slew_end: Annotated[Any, "s", finite] = 0.0
+    slew_start: Annotated[Any, "s", finite, instant] = 0.0
+    slew_end: Annotated[Any, "s", finite, instant] = 0.0
 
     def check(self, name: str) -> None:
         """Refuse, with ValueError, a slew that ends before its start."""
