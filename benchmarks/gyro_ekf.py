@@ -19,7 +19,7 @@ from jaxatt.loops import gyro_ekf
 from jaxatt.noise import BLOCK
 from jaxatt.sensors import gyro_pyramid
 from jaxatt.vec import Vec3, array, inverse, project
-from jaxatt.wheels import wheel_pyramid
+from jaxatt.wheels import park_pyramid
 
 LANES = 1024
 
@@ -95,7 +95,7 @@ def c_run(real, ticks: int):
     run = c_library(Path(__file__).with_suffix(".c"), kind).run
     p = gyro_ekf.params
     axes = lambda a: np.asarray(project(a, Vec3.of(jnp.eye(3))))  # (4, 3)
-    G, W = axes(gyro_pyramid(p.alpha, p.beta)), axes(wheel_pyramid(p.gamma)).T
+    G, W = axes(gyro_pyramid(p.alpha, p.beta)), axes(park_pyramid(p.gamma)).T
     J = np.array(p.J)
     model = np.concatenate([np.ravel(a) for a in (J, np.array(array(inverse(p.J))), G, W, p.Q, p.R, gyro_ekf.DT)])
     model = model.astype(real)

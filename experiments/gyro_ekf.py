@@ -25,7 +25,7 @@ from jaxatt.loops import gyro_ekf
 from jaxatt.loops.gyro_ekf import ANGLE, BIAS, DEG, DT, RATE, WHEEL, Scenario, direct, params, system
 from jaxatt.plot import COLOURS, GREY, LINES
 from jaxatt.vec import Vec3, array, resultant
-from jaxatt.wheels import wheel_pyramid
+from jaxatt.wheels import park_pyramid
 
 TABLE_4 = Scenario(
     angle=Vec3(-0.03 * DEG, 0.05 * DEG, 0.05 * DEG),
@@ -312,7 +312,7 @@ def with_filter(report, healthy) -> gyro_ekf.Log:
 
 def final_wheels(scenario: Scenario) -> np.ndarray:
     """Wheel momenta at rest, (4,): W^+ H and the part of h that gives no momentum; H in body axes at zero angles."""
-    wheels = wheel_pyramid(params.gamma)
+    wheels = park_pyramid(params.gamma)
     H0 = gyro_ekf.INERTIA @ scenario.w + resultant(wheels, scenario.h)
     H = quat_rotate(quat_from_euler(scenario.angle), H0)
     W = np.array([list(map(float, a)) for a in wheels]).T
@@ -324,7 +324,7 @@ def model(report, log) -> None:
     """Momentum, the Jacobian, float32, honest covariances."""
     quiet = Scenario(**QUIET)
     key = jax.random.key(0)
-    wheels = wheel_pyramid(params.gamma)
+    wheels = park_pyramid(params.gamma)
     attitude = quat_from_euler(log.angle)
     body = gyro_ekf.INERTIA @ log.w + resultant(wheels, log.h.T)
     H = np.asarray(array(quat_rotate(attitude, body)))

@@ -180,7 +180,7 @@ def hardware(report: Report):
         "dead zone of u, 1250 deg/s": (with_wheel(Wheel(dead_zone=1250.0)), (0.255, 0.051, 0.119), None),
         "Coulomb friction": (with_wheel(Wheel(friction=25000.0, slow=np.inf)), (0.251, 0.051, 0.119), None),
         "gate on u, 2000 deg/s": (with_wheel(Wheel(gate=2000.0)), (0.321, 0.097, 0.175), None),
-        "stiction, 30000 deg/s^2": (with_wheel(Wheel(stiction=3e4)), (0.280, 0.013, 0.241), None),
+        "dead drive, 30000 deg/s^2": (with_wheel(Wheel(dead_drive=3e4)), (0.280, 0.013, 0.241), None),
         "effectiveness 0.02 at rest": (with_wheel(Wheel(weakness=0.98)), (0.087, 0.013, 0.012), None),
     }  # fmt: skip
     noise = uniform([1], 0.01)

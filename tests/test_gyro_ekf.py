@@ -26,7 +26,7 @@ from jaxatt.loops.gyro_ekf import ANGLE, BIAS, DEG, DT, Scenario, direct, params
 from jaxatt.sensors import gyro_pyramid, parity_vector
 from jaxatt.sweeping import varied
 from jaxatt.vec import Mat3, Vec3, array, project, resultant
-from jaxatt.wheels import wheel_pyramid
+from jaxatt.wheels import park_pyramid
 
 SUBSETS = ["", "A", "B", "C", "D", "AB", "AC", "AD", "BC", "BD", "CD", "ABC", "ABD", "ACD", "BCD", "ABCD"]
 ZERO = [-10595, -3800, -4294, -4384, -10595, 3941, 3938, -6325, 4001, -4085, -4063, 4001, 3951, 3951, 4001, 6285]
@@ -74,7 +74,7 @@ def test_model_jacobian_is_the_specs():
     ]
     np.testing.assert_allclose(A[3:6, 3:6], angles, atol=1e-15)
     hat = lambda v: np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
-    J, W = np.array(params.J), matrix(wheel_pyramid(params.gamma)).T
+    J, W = np.array(params.J), matrix(park_pyramid(params.gamma)).T
     w = np.array([wx, wy, wz])
     np.testing.assert_allclose(A[6:9, 6:9], np.linalg.inv(J) @ (hat(J @ w + W @ h) - hat(w) @ J), atol=1e-15)
     np.testing.assert_allclose(A[6:9, 9:13], -np.linalg.inv(J) @ hat(w) @ W, atol=1e-15)
@@ -151,7 +151,7 @@ def test_biases_are_found(filtered):
 
 
 def test_momentum_is_conserved_and_ends_in_the_wheels(filtered):
-    body = params.J @ filtered.w + resultant(wheel_pyramid(params.gamma), np.moveaxis(filtered.h, -1, 0))
+    body = params.J @ filtered.w + resultant(park_pyramid(params.gamma), np.moveaxis(filtered.h, -1, 0))
     H = np.asarray(array(quat_rotate(quat_from_euler(filtered.angle), body)))
     assert np.abs(H - H[..., :1]).max() < 1e-9
     np.testing.assert_allclose(filtered.h[0, -1], [-16.1907, -15.3863, 20.4364, 9.6320], atol=5e-3)
@@ -229,7 +229,7 @@ def test_the_truth_obeys_eulers_equation():
     asked, effect, offset = (rng.normal(size=4) for _ in range(3))
     z = z._replace(computer=z.computer._replace(u=jnp.asarray(asked)), motors=Channel(effect, offset))
     rate = gyro_ekf.flow(params, scenario, 0.0, x, z)
-    W, w, h = matrix(wheel_pyramid(0.7)).T, array(x.w), np.asarray(x.h)
+    W, w, h = matrix(park_pyramid(0.7)).T, array(x.w), np.asarray(x.h)
     np.testing.assert_allclose(rate.h, effect * np.clip(asked, -scenario.torque_max, scenario.torque_max) + offset)
     torque = J @ array(rate.w) + W @ rate.h + np.cross(w, J @ w + W @ h)
     np.testing.assert_allclose(torque, [0.1, -0.2, 0.3], atol=1e-12)
@@ -280,9 +280,9 @@ def test_the_command_closes_on_what_is_off_the_slew():
     flown_off = [Vec3(*(array(a) + d)) for a, d in zip((aim.integral, aim.angle, aim.w), off)]
     gains = [np.diag(array(k)) for k in (p.k_f, p.k_i, p.k_p, p.k_d)]
     T = gains[0] @ sum(k @ d for k, d in zip(gains[1:], off))  # eq. (5)
-    u = np.linalg.pinv(matrix(wheel_pyramid(0.6)).T * np.array(up)) @ T
+    u = np.linalg.pinv(matrix(park_pyramid(0.6)).T * np.array(up)) @ T
     assert (np.abs(u) > 10).sum() == 1  # one wheel is at its limit
-    np.testing.assert_allclose(gyro_ekf.command(p, at(240, 30.0), up, *flown_off), np.clip(u, -10, 10), rtol=1e-4)
+    np.testing.assert_allclose(gyro_ekf.command(p, at(240, 30.0), up, *flown_off), np.clip(u, -10, 10), rtol=1e-9)
 
 
 def test_the_suspicion_is_that_of_plain_matrices():

@@ -400,7 +400,7 @@ def test_hardware():
         (HARDWARE, HARDWARE_DAY),
         (HARDWARE, HARDWARE_DAY._replace(wheel=Wheel())),
         (HARDWARE, HARDWARE_DAY._replace(wheel=Wheel(weakness=0.98))),
-        (HARDWARE, HARDWARE_DAY._replace(wheel=Wheel(stiction=3e4))),
+        (HARDWARE, HARDWARE_DAY._replace(wheel=Wheel(dead_drive=3e4))),
     ]
     log = together(variants, uniform(1, 0.01), wm.sampled)
     windows = [slice(0, 1000), slice(1000, 3000), slice(3000, None)]

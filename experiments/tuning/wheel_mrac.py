@@ -170,8 +170,8 @@ def against_baselines(report, cost, gradient, budget: int, seeds) -> None:
 
 # stick-slip
 
-SIZES = (0.0, 3e3, 1e4, 3e4, 1e5)  # [deg/s^2] friction, stiction; b_p times the width of dead zone and gate
-KINDS = ("friction", "stiction", "dead_zone", "gate")
+SIZES = (0.0, 3e3, 1e4, 3e4, 1e5)  # [deg/s^2] friction, dead drive; b_p times the width of dead zone and gate
+KINDS = ("friction", "dead_drive", "dead_zone", "gate")
 STEPS = (1e-4, 1e-2, 0.3)  # of the central difference, in log K
 
 
@@ -228,7 +228,7 @@ def stick_slip(report, n: int) -> None:
     left.set(ylabel="d log cost / d log K [1], mean and spread over runs", title="Exact gradient")
     right.set(ylabel="median |gradient / difference - 1| [1]", title="Against central differences")
     for ax in (left, right):
-        ax.set_xlabel("friction, stiction, $b_p$ x dead zone or gate [deg/s$^2$]")
+        ax.set_xlabel("friction, dead drive, $b_p$ x dead zone or gate [deg/s$^2$]")
         ax.set_xticks([1e3, 1e4, 1e5], ["none", "$10^4$", "$10^5$"])
         ax.grid(alpha=0.3)
         ax.legend(fontsize=7, ncols=1 if ax is left else 2)

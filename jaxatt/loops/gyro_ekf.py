@@ -27,7 +27,7 @@ from jaxatt.faults import Channel, Fault, Reading, active, channel, healthy, rea
 from jaxatt.filters import Belief, innovation, nees, predict, update
 from jaxatt.sensors import gyro_pyramid, parity_vector, rate_from, rate_maps
 from jaxatt.vec import Mat3, Vec3, array, cross, inverse, largest, project, resultant, zeros
-from jaxatt.wheels import allocation, wheel_pyramid, wheel_rate
+from jaxatt.wheels import allocation, park_pyramid, wheel_rate
 
 DEG = np.pi / 180
 DT = 0.125  # [s] gyros, sun sensor, tachometers
@@ -178,7 +178,7 @@ def init_truth(scenario: Scenario, computer):
     no = jnp.zeros(4, bool)
     gyro = project(gyro_pyramid(scenario.alpha, scenario.beta), x.w) + scenario.bias
     readings = Readings(Reading(array(x.angle), no[:3]), Reading(gyro, no), Reading(x.h, no), jnp.ones(4), jnp.zeros(3))
-    return x, Z(readings, computer, four(healthy()), wheel_pyramid(scenario.gamma))
+    return x, Z(readings, computer, four(healthy()), park_pyramid(scenario.gamma))
 
 
 def four(tree):
@@ -254,12 +254,12 @@ def command(params: Params, now, up, integral: Vec3, angle: Vec3, w: Vec3):
     """Rates of wheel momentum u (4,) [in-lbf] for the torque of the PID law (5), shared among the wheels that are up."""
     aim = target(params, now.t)
     torque = pid(angle - aim.angle, integral - aim.integral, w - aim.w, params.k_f, params.k_p, params.k_i, params.k_d)
-    return jnp.clip(allocation(-torque, wheel_pyramid(params.gamma), up), -params.torque_max, params.torque_max)
+    return jnp.clip(allocation(-torque, park_pyramid(params.gamma), up), -params.torque_max, params.torque_max)
 
 
 def drift(params: Params, u, x):
     """f: rates of integral, angles and body rate, three `Vec3`, of the filter's state x (17,) under command u (4,)."""
-    wheels = wheel_pyramid(params.gamma)
+    wheels = park_pyramid(params.gamma)
     angle, w = Vec3.of(x[ANGLE]), Vec3.of(x[RATE])
     angle_rate = euler_rate(angle, w) - Vec3(0.0, 0.0, params.orbit_rate)
     momentum = params.J @ w + resultant(wheels, x[WHEEL])
