@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxatt.faults import Reading, channel, read
-from jaxatt.vec import Vec3, array, cross, resultant
+from jaxatt.vec import Vec3, array, columns, cross, resultant
 
 
 def triad(faults: Vec3, t, std, normals, last: Vec3) -> Vec3:
@@ -48,20 +48,23 @@ def gyro_pyramid(alpha, beta) -> tuple[Vec3, Vec3, Vec3, Vec3]:
 
 
 def parity_vector(axes):
-    """Unit v, shape (4,), with v' G = 0 for four axes no three of which lie in a plane; first v positive.
+    """Unit v, shape (4,), with v' G = 0 for four axes that span space; its first number is not negative.
+
+    A gyro whose number is 0, for the other three lie in a plane, is not watched; NaN where all four lie in one.
 
     v' y of four gyros is free of the body rate: it holds errors only, but one number cannot tell whose.
     """
-    a, b, c, d = axes
+    a, b, c, d = columns(axes)
     v = jnp.stack([cross(b, c) @ d, -(cross(a, c) @ d), cross(a, b) @ d, -(cross(a, b) @ c)])
-    return v * (jnp.sign(v[0]) / jnp.sqrt(jnp.sum(v * v)))
+    return v * (jnp.where(v[0] < 0, -1, 1) / jnp.sqrt(jnp.sum(v * v)))
 
 
 def rate_maps(axes):
     """Pseudo-inverses, (2^n, 3, n), of n gyro axes for every subset in use; gyro i counts 2^i in its number."""
-    n = len(axes)
+    rows = jnp.stack([array(axis) for axis in columns(axes)])
+    n = len(rows)
     in_use = np.arange(2**n)[:, None] >> np.arange(n) & 1  # (2^n, n)
-    return jnp.linalg.pinv(jnp.stack([array(axis) for axis in axes]) * in_use[..., None], rtol=1e-5)
+    return jnp.linalg.pinv(rows * in_use[..., None])
 
 
 def rate_from(maps, gyro: Reading) -> Vec3:

@@ -173,6 +173,20 @@ class Quat(NamedTuple):
         return self.w * p.w + self.v @ p.v
 
 
+def _refused(operator: str, instead: str):
+    return lambda a, b: _undefined(b, operator, a, instead) if operator == "+" else _undefined(a, operator, b, instead)
+
+
+_NOT_OF_TUPLES = [("__radd__", "+", "`+` takes two operands of one type; a sum starts as in `sum(vectors, zeros())`")]
+_NOT_OF_TUPLES += [
+    (name, operator, "there is no order; compare `norm(v)` or components")
+    for name, operator in (("__lt__", "<"), ("__le__", "<="), ("__gt__", ">"), ("__ge__", ">="))
+]
+for _kind in (Vec3, Mat3, Quat):  # what a tuple does with these operators is no algebra: it puts together, and sorts
+    for _name, _operator, _instead in _NOT_OF_TUPLES:
+        setattr(_kind, _name, _refused(_operator, _instead))
+
+
 def array(v) -> jax.Array:
     """`Vec3`, `Quat` or `Mat3` as an array of shape (3,), (4,) or (3, 3)."""
     if isinstance(v, Mat3):
@@ -314,7 +328,7 @@ def columns(axes) -> list[Vec3]:
     elif isinstance(axes, (tuple, list)) and not isinstance(axes, Mat3):
         if axes and all(isinstance(a, Vec3) for a in axes):
             return list(axes)
-    elif hasattr(axes, "shape"):
+    elif not isinstance(axes, tuple) and hasattr(axes, "shape"):
         if axes.ndim != 2 or axes.shape[0] != 3 or not axes.shape[1]:
             raise ValueError(f"`axes` must have shape (3, n), but it is of shape {axes.shape}.")
         return [Vec3(*axis) for axis in axes.T]
@@ -324,7 +338,7 @@ def columns(axes) -> list[Vec3]:
 def project(axes, v: Vec3):
     """Components of v along n axes, an array (n,): G w for gyros, W' v for wheels.
 
-    axes: a tuple of `Vec3`, or an array (3, n). Raises ValueError or TypeError for anything else.
+    axes: a tuple of `Vec3`, a `Vec3` of shape (n,) or an array (3, n). Raises ValueError or TypeError for anything else.
     """
     return jnp.stack([a @ v for a in columns(axes)])
 
@@ -332,7 +346,7 @@ def project(axes, v: Vec3):
 def resultant(axes, s) -> Vec3:
     """Sum of s[i] along n axes, s of shape (n,): W h for wheels.
 
-    axes: a tuple of `Vec3`, or an array (3, n). Raises ValueError or TypeError for anything else, and where s has not
+    axes: a tuple of `Vec3`, a `Vec3` of shape (n,) or an array (3, n). Raises ValueError or TypeError for anything else, and where s has not
     as many numbers as there are axes.
     """
     vectors = columns(axes)

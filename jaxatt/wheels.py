@@ -74,12 +74,12 @@ def wheel_friction(wheel: Wheel, y, driven):
     """
     sticks = wheel.stiction > 0
     static = jnp.where(sticks, jnp.maximum(wheel.stiction, wheel.friction), 0)
-    width = jnp.where(sticks, wheel.settle * static, wheel.creep)
+    width = jnp.where(sticks, jnp.maximum(wheel.settle * static, 1e-9), wheel.creep)  # so that gradients stay finite
     turned = jnp.tanh(y / width)
     kinetic = wheel.friction * jnp.exp(-jnp.square(y / wheel.slow))
     risen = jnp.maximum(static - wheel.friction, 0)
     level = kinetic + risen * jnp.exp(-jnp.square(jnp.maximum(jnp.abs(y) - width, 0) / wheel.stribeck))
-    held = jnp.where(y * driven >= 0, jnp.clip(driven, -static, static), 0)
+    held = jnp.where(jnp.sign(y) * driven >= 0, jnp.clip(driven, -static, static), 0)
     return -turned * level - (1 - jnp.abs(turned)) * held - wheel.viscous * y
 
 

@@ -60,4 +60,18 @@ def test_the_rate_comes_from_the_gyros_in_use_alone():
     for used in np.ndindex(2, 2, 2, 2):
         used = np.array(used, bool)
         found = array(rate_from(maps, Reading(np.where(used, G @ w, np.nan), used)))
-        np.testing.assert_allclose(found, np.linalg.pinv(G[used]) @ (G[used] @ w), atol=1e-6)
+        np.testing.assert_allclose(found, np.linalg.pinv(G[used]) @ (G[used] @ w), atol=1e-14)
+
+
+def test_rate_maps_are_exact_for_axes_that_are_nearly_parallel():
+    axes = gyro_pyramid(1e-3, 60 * DEG)
+    G = np.asarray(project(axes, Vec3.of(np.eye(3))))
+    np.testing.assert_allclose(rate_maps(axes)[7], np.linalg.pinv(G * [[1], [1], [1], [0]]), rtol=1e-9, atol=1e-9)
+    np.testing.assert_array_equal(rate_maps(G.T), rate_maps(axes))  # an array (3, n) is read by columns
+
+
+def test_the_parity_vector_watches_what_it_can_where_three_axes_lie_in_a_plane():
+    a, b, c = (Vec3.of(row) for row in np.eye(3))
+    v = np.asarray(parity_vector((a, b, c, (b + c) / np.sqrt(2))))  # the last three lie in a plane
+    np.testing.assert_allclose(np.abs(v), [0, 0.5, 0.5, np.sqrt(0.5)], atol=1e-15)
+    np.testing.assert_allclose(v @ np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0.5**0.5, 0.5**0.5]]), 0, atol=1e-15)

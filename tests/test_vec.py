@@ -64,6 +64,7 @@ def test_hamilton_product_of_the_units():
     assert array(i * i).tolist() == array(-one).tolist()
 
 
+TUPLE = (1.0, 2.0, 3.0)
 V, M, Q = Vec3(1.0, 2.0, 3.0), diagonal((1.0, 2.0, 3.0)), Quat(1.0, 0.0, 0.0, 0.0)
 
 
@@ -86,10 +87,20 @@ V, M, Q = Vec3(1.0, 2.0, 3.0), diagonal((1.0, 2.0, 3.0)), Quat(1.0, 0.0, 0.0, 0.
         (lambda: V / V, r"`Vec3 / Vec3` is not defined"),
         (lambda: M / M, r"`Mat3 / Mat3` is not defined: `inverse\(m\)` is the inverse"),
         (lambda: Q / Q, r"`Quat / Quat` is not defined"),
-        (lambda: 1 + V, "unsupported operand"),  # pyright: ignore[reportOperatorIssue]
+        (lambda: 1 + V, r"`number \+ Vec3` is not defined: .*`sum\(vectors, zeros\(\)\)`\.$"),  # pyright: ignore[reportOperatorIssue]
+        (lambda: sum([V, V]), r"`number \+ Vec3` is not defined"),  # pyright: ignore[reportArgumentType, reportCallIssue]
+        (lambda: TUPLE + V, r"`tuple \+ Vec3` is not defined"),
+        (lambda: TUPLE + M, r"`tuple \+ Mat3` is not defined"),
+        (lambda: V < 2 * V, r"`Vec3 < Vec3` is not defined: there is no order; compare `norm\(v\)` or components\.$"),
+        (lambda: max(V, V), r"`Vec3 > Vec3` is not defined"),
+        (lambda: sorted([Q, Q]), r"`Quat < Quat` is not defined"),
+        (lambda: V >= 1, r"`Vec3 >= number` is not defined"),  # pyright: ignore[reportOperatorIssue]
+        (lambda: V**2, "unsupported operand"),  # pyright: ignore[reportOperatorIssue]
+        (lambda: abs(V), "bad operand"),  # pyright: ignore[reportArgumentType]
+        (lambda: jnp.ones(3) + V, r"`array \+ Vec3` is not defined"),  # pyright: ignore[reportOperatorIssue]
         (lambda: 1 - V, "unsupported operand"),  # pyright: ignore[reportOperatorIssue]
         (lambda: 1 / V, "unsupported operand"),  # pyright: ignore[reportOperatorIssue]
-        (lambda: np.ones(3) + V, "not implemented for NumPy arrays"),
+        (lambda: np.ones(3) + V, r"`array \+ Vec3` is not defined|not implemented for NumPy arrays"),
         (lambda: np.ones((3, 3)) @ V, "Vec3"),
     ],
 )
@@ -136,7 +147,7 @@ def test_safe_sqrt_lets_nan_through():
 AXES = RNG.normal(size=(3, 4))
 
 
-@pytest.mark.parametrize("axes", [AXES, jnp.asarray(AXES), tuple(map(Vec3.of, AXES.T))])
+@pytest.mark.parametrize("axes", [AXES, jnp.asarray(AXES), Vec3(*AXES), tuple(map(Vec3.of, AXES.T))])
 def test_project_and_resultant_are_the_products_with_a_matrix_of_columns(axes):
     v, s = RNG.normal(size=3), RNG.normal(size=4)
     np.testing.assert_allclose(vec.project(axes, Vec3.of(v)), AXES.T @ v, rtol=1e-14)
@@ -149,6 +160,8 @@ def test_project_and_resultant_are_the_products_with_a_matrix_of_columns(axes):
         (AXES.T, ValueError, r"`axes` must have shape \(3, n\), but it is of shape \(4, 3\)"),
         (AXES[:, 0], ValueError, r"`axes` must have shape \(3, n\), but it is of shape \(3,\)"),
         (V, TypeError, r"`axes` must be Vec3, one for each axis, or an array \(3, n\), but it is Vec3"),
+        (M, TypeError, r"`axes` must be Vec3, .* but it is Mat3"),  # by rows or by columns?
+        ([], TypeError, r"`axes` must be Vec3, .* but it is list"),
         (AXES.tolist(), TypeError, r"`axes` must be Vec3, .* but it is list"),
         (3.0, TypeError, r"`axes` must be Vec3, .* but it is float"),
     ],
@@ -162,6 +175,8 @@ def test_what_holds_no_axes_is_refused(axes, error, message):
 def test_a_resultant_takes_one_number_for_each_axis():
     with pytest.raises(ValueError, match="`s` must hold a number for each of the 4 axes, but it holds 3"):
         vec.resultant(AXES, np.ones(3))
+    with pytest.raises(ValueError, match="`s` must hold a number for each of the 4 axes, but it holds one"):
+        vec.resultant(AXES, 1.0)
 
 
 # the largest eigenvalue
