@@ -7,7 +7,10 @@ In a batch the filter runs one kernel over all scenarios (`jaxatt.batching`): co
 loop over components is rolled, for unrolled or reduced covariances are slow. Reverse mode needs a `jax.vmap` around it,
 which the engine always has. `star_filters` writes filters of few states as plain rows.
 
-May import: check, compiling, batching, faults.
+Angles: a row of h, or a component of the state, that is an angle states the length of its turn (`period`), 2 pi or 360 as
+its unit is; its residual is then taken modulo a turn, as sensors wrap at +-180 deg and filters do not.
+
+May import: check, compiling, batching, faults, attitude.
 """
 
 from __future__ import annotations
@@ -21,6 +24,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxatt import check
+from jaxatt.attitude import wrapped
 from jaxatt.batching import lanes_last
 from jaxatt.compiling import shared
 from jaxatt.faults import Reading
@@ -67,7 +71,7 @@ def predict(belief: Belief, f: Callable, steady, Q, dt) -> Belief:
     return lanes_last(_predict, f, x, Belief(x, P), steady, Q, jnp.asarray(dt, x.dtype))
 
 
-def update(belief: Belief, reading: Reading, h: Callable, R) -> tuple[Belief, Innovation]:
+def update(belief: Belief, reading: Reading, h: Callable, R, period: Any = None) -> tuple[Belief, Innovation]:
     """The belief after the measurements that are valid and finite; the others move neither mean nor covariance.
 
     x + K (y - h(x)) and P - K S K' with S = H P H' + R, H = dh/dx and K = P H' S^-1, one measurement after the other.
@@ -80,6 +84,8 @@ def update(belief: Belief, reading: Reading, h: Callable, R) -> tuple[Belief, In
         reading: value (k,) and valid (k,).
         h: the expected measurement as a function of the state (n,): an array (k,) or any tree of arrays with k numbers.
         R: (k,) variances of the independent measurement noises.
+        period: (k,) one turn of each row that is an angle, in its unit (`jaxatt.attitude.full_turn`), inf for the others:
+            residuals y - h(x) are then at most half a turn. None: no row is an angle.
 
     Returns:
         The belief and what the measurements told; fields of `Innovation` that nobody uses cost nothing in a jitted run.
@@ -89,26 +95,28 @@ def update(belief: Belief, reading: Reading, h: Callable, R) -> tuple[Belief, In
     """
     x, P = _fitting(belief)
     k = _count(h, x)
-    y, R = (jnp.broadcast_to(jnp.asarray(a, x.dtype), (k,)) for a in (reading.value, R))
-    operands = Belief(x, P), Reading(y, jnp.broadcast_to(reading.valid, (k,))), R
+    y, R, period = _rows_of(k, x, reading.value, R, period)
+    operands = Belief(x, P), Reading(y, jnp.broadcast_to(reading.valid, (k,))), R, period
     return lanes_last(_update, h, x, *operands, smooth=partial(_update, triangle=False))
 
 
-def innovation(belief: Belief, value, h: Callable, R):
-    """Residual value - h(mean) and its variance, both (k,), of each measurement by itself; h and R (k,) as of `update`."""
+def innovation(belief: Belief, value, h: Callable, R, period: Any = None):
+    """Residual value - h(mean) and its variance, both (k,), of each measurement by itself.
+
+    h, R (k,) and period (k,) as of `update`.
+    """
     x, P = _fitting(belief)
-    k = _count(h, x)
-    value, R = (jnp.broadcast_to(jnp.asarray(a, x.dtype), (k,)) for a in (value, R))
-    return lanes_last(_innovation, h, x, Belief(x, P), value, R)
+    return lanes_last(_innovation, h, x, Belief(x, P), *_rows_of(_count(h, x), x, value, R, period))
 
 
 @jax.jit  # which keeps its loops compiled from call to call
-def nees(belief: Belief, truth):
+def nees(belief: Belief, truth, period: Any = None):
     """Normalised estimation error squared e' P^-1 e, e = truth - mean (n,); chi-square with n degrees of freedom.
 
-    It is the NIS of the whole state measured without noise, and needs no solver. NaN: P is no covariance.
+    It is the NIS of the whole state measured without noise, and needs no solver. NaN: P is no covariance. period: (n,) one
+    turn of each component that is an angle, inf for the others, as in `update`.
     """
-    e = truth - jnp.asarray(belief.mean)
+    e = _residual(truth, jnp.asarray(belief.mean), period)
     at_zero = Belief(jnp.zeros_like(e), belief.cov)
     return update(at_zero, Reading(e, jnp.ones(e.shape, bool)), lambda x: x, jnp.zeros_like(e))[1].nis
 
@@ -119,6 +127,16 @@ def _fitting(belief: Belief) -> tuple[Any, Any]:
     if x.ndim != 1 or P.shape != (*x.shape, *x.shape):
         check.refuse("belief", "hold a mean (n,) and a cov (n, n)", f"of shapes {x.shape} and {P.shape}")
     return x, P
+
+
+def _rows_of(k: int, x, *numbers):
+    """Numbers of k measurements, (k,), of the type of x; None stays None."""
+    return tuple(None if a is None else jnp.broadcast_to(jnp.asarray(a, x.dtype), (k,)) for a in numbers)
+
+
+def _residual(value, expected, period):
+    """The difference, of angles modulo a turn."""
+    return value - expected if period is None else wrapped(value - expected, period)
 
 
 def _count(f: Callable, x) -> int:
@@ -173,12 +191,12 @@ def _expected(h: Callable, belief: Belief):
     return expected, H, jax.vmap(H, 1, 1)(belief.cov)
 
 
-def _innovation(h: Callable, belief: Belief, value, R):
+def _innovation(h: Callable, belief: Belief, value, R, period):
     expected, H, HP = _expected(h, belief)
-    return value - expected, _rows(lambda i: H(HP[i])[i], value.shape[0]) + R
+    return _residual(value, expected, period), _rows(lambda i: H(HP[i])[i], value.shape[0]) + R
 
 
-def _update(h: Callable, belief: Belief, reading: Reading, R, triangle=True) -> tuple[Belief, Innovation]:
+def _update(h: Callable, belief: Belief, reading: Reading, R, period, triangle=True) -> tuple[Belief, Innovation]:
     """Cholesky's S = L L' row by row: D = L^-1 H P, whence P+ = P - D' D is symmetric by construction.
 
     e = L^-1 (y - h(x)) and E = L', each row as soon as the rows before it are known: those that are not used stay zero.
@@ -188,7 +206,7 @@ def _update(h: Callable, belief: Belief, reading: Reading, R, triangle=True) -> 
     n, k = x.shape[0], R.shape[0]
     expected, H, HP = _expected(h, belief)
     due = reading.valid & jnp.isfinite(reading.value) & ~jnp.isposinf(R)
-    value = jnp.where(due, jnp.where(due, reading.value, 0) - expected, 0)
+    value = jnp.where(due, _residual(jnp.where(due, reading.value, 0), expected, period), 0)
     impossible = jnp.any(due & ~(R >= 0), axis=0) | ~jnp.all(_rows(lambda i: P[i, i], n) >= 0, axis=0)
     noise = jnp.where(due & (R >= 0), R, 1)
     number = jnp.finfo(x.dtype)

@@ -8,17 +8,15 @@ loop gives the functions and what the computer knows at the start::
 
 Of the computer the scenario decides the start alone: initial estimates and the like. Where an observer or an adaptive law
 moves between ticks (`observer_pd`, `wheel_mrac`), ``flow=loop.computer_flow`` and the system's ``substeps`` go along.
-`load` reads a CSV or Parquet file, which never executes code, and `resample` brings its samples to the ticks.
+`load` reads a CSV or Parquet file, which never executes code, `unit_quaternions` mends quaternions of few digits, and
+`resample` brings samples to the ticks.
 
-May import: check, clock, faults, contract, compiling, engine.
+May import: check, clock, faults, contract, compiling, engine, logfiles.
 """
 
 from __future__ import annotations
 
-import csv
-import re
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +30,7 @@ from jaxatt.compiling import compiled
 from jaxatt.contract import Now
 from jaxatt.engine import alone, match_state, rk4
 from jaxatt.faults import Reading
+from jaxatt.logfiles import SEPARATORS, STAMPS, column, read, time_column
 
 EXAMPLE = Path(__file__).parent / "data" / "telemetry.csv"  # made by notebooks/telemetry.py, with a hidden fault
 SPARSE = 1000  # ticks per sample beyond which the times are taken to be wrong
@@ -146,78 +145,72 @@ def _replay(decide, flow, dt, substeps, params, computer, readings, between):
 # files
 
 
-def load(path, units: Mapping[str, str], *, time: str = "time") -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Times (T,) [s] and channels (T,) of a ``.csv`` or ``.parquet`` file whose columns are named "gyro_a [rad/s]".
+def load(
+    path,
+    units: Mapping[str, str | None],
+    *,
+    time: str = "time",
+    stamps: str | None = None,
+    separator: str = ",",
+    decimal: str = ".",
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Times and channels of a ``.csv`` or ``.parquet`` file whose columns are named "gyro_a [rad/s]".
 
-    units: the unit that each channel must have, by name; other columns are left alone. time: name of the column of
-    times. Empty cells are missing samples, NaN. Needs the extra ``data``.
+    A channel is asked for by name and unit: of "gyro [deg/s]" and "gyro [rad/s]", ``{"gyro": "rad/s"}`` is the second;
+    "gyro (rad/s)" is the same name. Or by its whole header, whatever it looks like: ``{"q[0]": "1", "gx (deg/s)":
+    "deg/s"}``; a unit in it must be the one asked for. Columns that nobody asks for are left alone.
 
-    Raises ValueError, in one line, for a missing channel, another unit, a column twice, a cell that is no number or
-    not finite, times that do not increase, and a file that cannot be read as what its name says; ImportError without
-    pandas or pyarrow.
+    An empty cell and words such as NaN are missing samples, NaN. Rows of one time, such as those of several instruments,
+    become one where no channel is given twice. Blank lines and lines that begin with # are passed over. Needs the extra
+    ``data``.
+
+    Args:
+        path: of the file.
+        units: the unit of each channel that is asked for; None for a whole header that says none.
+        time: name or whole header of the column of times.
+        stamps: unit of the times: "s", "ms", "us", "ns", or "iso" for dates of ISO 8601, UTC where they say no offset;
+            None: the header says [s].
+        separator: what stands between the cells of a CSV file: ",", ";", "|", a tab, or " " for any run of spaces.
+        decimal: "." or ",", the decimal sign of a CSV file.
+
+    Returns:
+        Times (T,) [s], of dates since 1970, and channels (T,) by the keys of ``units``.
+
+    Raises:
+        ValueError: in one line: a channel that is missing, not in the unit asked for or not the only one, a header twice,
+            a row with more or fewer cells than the header (one empty cell at its end may be too many), a cell that is no
+            number or not finite, decimal commas, separators and stamps other than those asked for, times that do not
+            increase, a file that cannot be read as what its name says.
+        TypeError: what is no path or no mapping.
+        ImportError: without pandas or pyarrow.
+
+    Example:
+        >>> t, columns = load("log.csv", {"gyro": "deg/s", "q[0]": "1"}, separator=";", decimal=",", stamps="ms")
     """
     path = check.place("path", path)
     check.mapping("units", units)
-    table = _table(path)
-    there = {}
-    for name in map(str, table.columns):
-        split = re.fullmatch(r"(.*?)\s*(?:\[([^]]*)\])?", name)
-        there[split[1] if split else name] = (name, split[2] if split else None)
-    columns = {}
-    for name, unit in {time: "s", **units}.items():
-        if name not in there:
-            check.refuse(
-                f"{name} [{unit}]", f"be a column of {path.name}", "not among " + ", ".join(map(str, table.columns))
-            )
-        given, found = there[name]
-        if found != unit:
-            check.refuse(name, f"be given in [{unit}] by {path.name}", f"in the column {given!r}")
-        columns[name] = _numbers(given, table[given])
-    return checked(columns.pop(time), columns)
+    for name, value, allowed in (
+        ("stamps", stamps, (None, *STAMPS)),
+        ("separator", separator, SEPARATORS),
+        ("decimal", decimal, (".", ",")),
+    ):
+        if not (value is None or isinstance(value, str)) or value not in allowed:
+            check.refuse(name, f"be one of {allowed}", check.short(value))
+    if separator == decimal:
+        check.refuse("separator", "not be the decimal sign", repr(separator))
 
+    def pick(header: list[str]) -> list[int]:
+        at = time_column(path.name, header, separator, str(time), stamps)
+        return [at, *(column(path.name, header, separator, str(name), unit) for name, unit in units.items())]
 
-def _table(path: Path):
-    try:
-        import pandas
-        import pyarrow.parquet
-    except ImportError as error:
-        raise ImportError("Reading files needs pandas and pyarrow: pip install 'jaxatt[data]'.") from error
-    kind = path.suffix.lower()
-    if kind not in (".csv", ".parquet"):
-        check.refuse("path", "end in .csv or .parquet", repr(path.name))
-    with path.open("rb") as file:  # an open file: pandas fetches no address and unpacks nothing
-        try:
-            if kind == ".parquet":
-                return pyarrow.parquet.read_table(file).to_pandas(ignore_metadata=True)
-            header = next(csv.reader([file.readline().decode("utf-8-sig").strip()]), [])
-            names = [name.strip() for name in header]
-            if len(set(names)) == len(names):
-                since = tuple(map(int, pandas.__version__.split(".")[:2]))  # from 3.1 on every number is read exactly
-                exact: dict[str, Any] = {} if since >= (3, 1) else {"float_precision": "round_trip"}
-                return pandas.read_csv(file, header=None, names=names, index_col=False, **exact)
-        except Exception as error:  # of pandas, PyArrow, the csv module or the decoder
-            reason = " ".join(str(error).split())[:200]
-            raise ValueError(f"`path` must be a {kind[1:]} file, but {path.name} is none: {reason}") from None
-        check.refuse("path", "name every column once", f"{path.name} with {sorted(header)}")
-
-
-def _numbers(name: str, column) -> np.ndarray:
-    with suppress(TypeError, ValueError):
-        return np.asarray(column, float)
-    row = next(row for row, cell in enumerate(column) if not _is_number(cell))
-    check.refuse(name, "hold numbers", f"{column[row]!r} in row {row}")
-
-
-def _is_number(cell) -> bool:
-    try:
-        float(cell)
-    except (TypeError, ValueError):
-        return False
-    return True
+    t, *values = read(path, pick, separator, decimal, stamps or "s")
+    return checked(t, dict(zip(units, values)))
 
 
 def checked(t, columns: Mapping[str, Any]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Times and channels of one length as float arrays; NaN in a channel is a missing sample.
+
+    Rows of one time, as several instruments write them, become one, where no channel has two samples.
 
     Raises ValueError for times that are not finite or do not increase, infinite samples, a channel without any
     sample, and lengths that differ. Rows are counted from 0.
@@ -229,9 +222,14 @@ def checked(t, columns: Mapping[str, Any]) -> tuple[np.ndarray, dict[str, np.nda
     if not np.isfinite(t).all():
         row = int(np.flatnonzero(~np.isfinite(t))[0])
         check.refuse("time", "be finite", f"{t[row]:g} in row {row}")
-    if (np.diff(t) <= 0).any():
-        row = int(np.flatnonzero(np.diff(t) <= 0)[0]) + 1
+    first = np.append(True, np.diff(t) > 0)  # of the rows of one time
+    group = np.cumsum(first) - 1
+
+    def unordered(row):
         check.refuse("time", "increase from row to row", f"{t[row]:.9g} after {t[row - 1]:.9g} in row {row}")
+
+    if (np.diff(t) < 0).any():
+        unordered(int(np.flatnonzero(np.diff(t) < 0)[0]) + 1)
     out = {}
     for name, values in columns.items():
         out[name] = a = np.asarray(check.real(name, values), float)
@@ -242,7 +240,54 @@ def checked(t, columns: Mapping[str, Any]) -> tuple[np.ndarray, dict[str, np.nda
             check.refuse(name, "be finite, or NaN where a sample is missing", f"{a[row]:g} in row {row}")
         if np.isnan(a).all():
             check.refuse(name, "hold at least one sample", "missing in every row")
-    return t, out
+        rows = np.flatnonzero(~np.isnan(a))
+        if (twice := np.diff(group[rows]) == 0).any():
+            unordered(int(rows[1:][twice][0]))
+        out[name] = merged = np.full(first.sum(), np.nan)
+        merged[group[rows]] = a[rows]
+    return t[first], out
+
+
+def unit_quaternions(columns: Mapping[str, Any], names) -> dict[str, np.ndarray]:
+    """Four channels (T,) of quaternions as they are logged, made unit quaternions without jumps of sign.
+
+    Logs hold three digits or counts of 16 bits: a common scale, and lengths within 5 % of it, are taken. q and -q are
+    one attitude: each quaternion has the sign that is nearest to the one before. A sample with a part missing is missing.
+
+    Args:
+        columns: channels by name, as `load` gives them.
+        names: of the four, w first: that is where a log says whether its scalar is first or last.
+
+    Returns:
+        The four channels by name, for ``columns | unit_quaternions(columns, names)``.
+
+    Raises:
+        ValueError: names that are not four channels, no complete sample, a length of zero or more than 5 % off the median.
+    """
+    check.mapping("columns", columns)
+    names = list(names) if np.iterable(names) and not isinstance(names, str) else []
+    if len(names) != 4 or not all(name in list(columns) for name in names):
+        check.refuse("names", f"be four channels ({', '.join(map(str, columns))})", check.short(names))
+    parts = [np.asarray(check.real(str(name), columns[name]), float) for name in names]
+    if len({part.shape for part in parts}) > 1 or parts[0].ndim != 1:
+        check.refuse("names", "be four channels of one shape (T,)", f"of shapes {[part.shape for part in parts]}")
+    q = np.stack(parts)
+    known = np.isfinite(q).all(axis=0)
+    length = np.sqrt(np.sum(q**2, axis=0))
+    if not known.any():
+        check.refuse(str(names[0]), "belong to one complete quaternion at least", "missing in every row")
+    scale = np.median(length[known])
+    off = known & ~(np.abs(length - scale) <= 0.05 * scale) | known & (length == 0)
+    if off.any():
+        row = int(np.flatnonzero(off)[0])
+        must = f"belong to quaternions of one length (median {scale:.4g}, within 5 %)"
+        check.refuse(str(names[0]), must, f"of length {length[row]:.4g} in row {row}")
+    unit = q[:, known] / length[known]
+    turns = np.sign(np.sum(unit[:, 1:] * unit[:, :-1], axis=0))
+    unit[:, 1:] *= np.cumprod(np.where(turns < 0, -1.0, 1.0))
+    out = np.full_like(q, np.nan)
+    out[:, known] = unit
+    return dict(zip(names, out))
 
 
 def resample(t, columns: Mapping[str, Any], *, dt: float, ticks: int | None = None) -> dict[str, Reading]:

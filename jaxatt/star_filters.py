@@ -280,7 +280,7 @@ def quaternion_error(x: Quat, P, q: Quat):
     P: covariance of x, 4 rows of 4 [1]. The turn is taken to first order. NEES: error squared in units of its covariance, of
     the vector part and of all four components.
     """
-    e = x - q
+    e = x - q * jnp.where(x @ q < 0, -1, 1)  # q and -q are one attitude
     b = Vec3(*P[0][1:4])
     D_inv = inverse(Mat3(*(Vec3(*row[1:4]) for row in P[1:4])))
     nees = e.v @ (D_inv @ e.v)

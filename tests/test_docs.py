@@ -25,7 +25,7 @@ SHOWN = {
     for page in ROOT.glob("docs/api/*.md")
     for name, members in re.findall(r"automodule:: (jaxatt[\w.]*)\n(?: +:members: (.*)\n)?", page.read_text())
 }
-INTERNAL = {"jaxatt.batching", "jaxatt.loops"}  # how it works inside, and the folder of the loops
+INTERNAL = {"jaxatt.batching", "jaxatt.logfiles", "jaxatt.loops"}  # how it works inside, and the folder of the loops
 # words of the house, defined where the reference begins (docs/api/index.md)
 HOUSE = set(re.findall(r"^\| `(\w+)`", (ROOT / "docs/api/index.md").read_text(), re.M))
 PLAIN = (inspect.Parameter.empty, "Any", "int", "float", "str", "bool")

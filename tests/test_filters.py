@@ -10,6 +10,7 @@ import pytest
 from scipy.linalg import expm
 
 from jaxatt import Reading, Vec3, simulate
+from jaxatt.attitude import full_turn
 from jaxatt.contract import System
 from jaxatt.engine import every
 from jaxatt.filters import Belief, innovation, nees, predict, update
@@ -136,6 +137,54 @@ def test_float32_stays_positive_with_precise_sensors():
     b, _ = jax.jit(lambda b, ys: jax.lax.scan(step, b, ys))(start, jnp.zeros((4000, 2), jnp.float32))
     assert b.cov.dtype == jnp.float32
     assert np.linalg.eigvalsh(np.asarray(b.cov, float)).min() > 0
+
+
+# angles
+
+
+@pytest.mark.parametrize("unit", ["rad", "deg"])
+def test_residuals_of_angles_are_taken_modulo_a_turn_of_their_unit(unit):
+    """A star sensor wraps at +-180 deg, the filter that follows a spinning body does not; a gain beside it has no turn."""
+    turn = full_turn(unit)
+    period = np.array([turn, np.inf])
+    b = Belief(jnp.array([0.49 * turn, 10 * turn]), jnp.diag(jnp.array([1.0, 2.0]) * turn**2 * 1e-4))
+    run = jax.jit(lambda y, period: update(b, seen(y), lambda x: x, R=jnp.array([1e-6, 1e-6]) * turn**2, period=period))
+    for turns in (0, -1, 3):
+        got, told = run(np.array([(0.5 + turns) * turn, 10.5 * turn]), period)
+        np.testing.assert_allclose(told.value, [0.01 * turn, 0.5 * turn], rtol=1e-9)
+        np.testing.assert_allclose(got.mean[0], (0.49 + 0.01 / 1.01) * turn, rtol=1e-9)  # not from turn to turn
+        np.testing.assert_allclose(told.nis, 0.01**2 / 1.01e-4 + 0.5**2 / 2.01e-4, rtol=1e-9)
+        residual, _ = innovation(b, [(0.5 + turns) * turn, 10.5 * turn], lambda x: x, np.ones(2), period)
+        np.testing.assert_allclose(residual, [0.01 * turn, 0.5 * turn], rtol=1e-9)
+        truth = b.mean + jnp.array([(0.01 + turns) * turn, 0.0])
+        np.testing.assert_allclose(nees(b, truth, period), 0.01**2 / 1e-4, rtol=1e-9)
+    _, told = run(np.array([-0.5 * turn, 10.5 * turn]), None)
+    assert told.value[0] == pytest.approx(-0.99 * turn)  # where nobody says that it is an angle
+
+
+def test_a_filter_of_a_spinning_body_follows_sensors_that_wrap():
+    """Alone, in a batch, and differentiated: the wrap changes nothing but the numbers that are read."""
+    rate, dt = 40.0, 0.1
+    truth = 150 + rate * dt * np.arange(300)
+    read = (truth + 180) % 360 - 180
+
+    def run(log_r, read):
+        def step(b, y):
+            b = predict(b, lambda x: x[1:], 0.0, np.array([1e-3, 1e-2]), dt)
+            b, told = update(b, seen(y[None]), lambda x: x[:1], jnp.exp(log_r), 360.0)
+            return b, (b.mean, told.nis, told.nll)
+
+        start = Belief(jnp.array([150.0 - rate * dt, 0.0]), jnp.diag(jnp.array([1.0, 1e4])))
+        return jax.lax.scan(step, start, read)[1]
+
+    many = jax.jit(jax.vmap(run, (None, 0)))
+    mean, nis, _ = many(np.log(1e-2), np.stack([read, truth]))
+    np.testing.assert_allclose(mean[0, :, 0], mean[1, :, 0], rtol=1e-9)
+    np.testing.assert_allclose(mean[0, 200:, 0], truth[200:], atol=1e-3)
+    np.testing.assert_allclose(nis[0], nis[1], atol=1e-6)
+    slope = jax.jit(jax.grad(lambda log_r: jnp.sum(jax.vmap(run, (None, 0))(log_r, read[None])[2])))(np.log(1e-2))
+    ahead, back = (np.sum(many(np.log(1e-2) + d, np.stack([read, truth]))[2][0]) for d in (1e-5, -1e-5))
+    np.testing.assert_allclose(slope, (ahead - back) / 2e-5, rtol=1e-6)
 
 
 # singular and impossible covariances

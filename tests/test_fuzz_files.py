@@ -17,7 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxatt.campaign import dataset, extend, rerun, run, sampling_key, scenarios, until
-from jaxatt.replay import load
+from jaxatt.replay import load, unit_quaternions
 from jaxatt.tuning import tune
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -67,21 +67,80 @@ CSV = TABLE.to_csv(index=False).encode()
 PARQUET = TABLE.to_parquet()
 
 
+ODD_ROWS = st.lists(
+    st.lists(st.sampled_from(["0", "1", "2", "0,5", "", "nan", "x", '"', "1_0", "2024-03-01T12:00:00Z", "1e3", "#", "\u0663"]), max_size=4),
+    max_size=5,
+)  # fmt: skip
+ODD_HEADS = st.lists(
+    st.sampled_from(["time [s]", "gyro [rad/s]", "gyro [deg/s]", "q[0]", "gyro (rad/s)", "note", ""]), max_size=5
+)
+
+
+@st.composite
+def odd_logs(draw):
+    """Text with the cells of logs, between any separators, with any ends of lines."""
+    separator, end = (
+        draw(st.sampled_from([",", ";", "\t", " ", "|"])),
+        draw(st.sampled_from(["\n", "\r\n", "\r", "\n\n"])),
+    )
+    head = draw(st.one_of(st.just(["time [s]", "gyro [rad/s]"]), ODD_HEADS))
+    return (
+        draw(st.sampled_from(["", "\ufeff", "# a log" + end])).encode()
+        + end.join(map(separator.join, [head, *draw(ODD_ROWS)])).encode()
+    )
+
+
 @fuzzed
 @given(
-    data=st.one_of(spoiled(CSV), spoiled(PARQUET)),
+    data=st.one_of(spoiled(CSV), spoiled(PARQUET), odd_logs()),
     name=st.sampled_from(["a.csv", "a.parquet", "a.csv", "a.parquet", "a.txt", "a.csv.gz", "a"]),
     units=st.sampled_from(
-        [{"gyro": "rad/s"}] * 4 + [{}, {"gyro": "deg/s"}, {"star": "1"}, {3: 3}, None, "gyro", {"note": None}]
+        [{"gyro": "rad/s"}] * 4 + [{}, {"gyro": "deg/s"}, {"star": "1"}, {3: 3}, None, "gyro", {"note": None}, {"q[0]": "1"}]
     ),
     time=st.sampled_from(["time"] * 4 + ["gyro", "note", "", 3, None]),
-)
-def test_recorded_files(data, name, units, time):
+    how=st.fixed_dictionaries({}, optional=dict(
+        stamps=st.sampled_from([None, "s", "ms", "ns", "iso", "min", 3, []]),
+        separator=st.sampled_from([",", ";", "\t", " ", "|", "", 3, []]), decimal=st.sampled_from([".", ",", "'", None]),
+    )),
+)  # fmt: skip
+def test_recorded_files(data, name, units, time, how):
     with TemporaryDirectory() as folder:
         path = Path(folder, name)
         path.write_bytes(data)
-        words = {"path", "units", "time", "gyro", "star", "note", "rad", "s", *map(str, units or ()), str(time)}
-        answered(lambda: load(path, units, time=time), words)
+        words = {
+            "path",
+            "units",
+            "time",
+            "gyro",
+            "star",
+            "note",
+            "rad",
+            "s",
+            "q",
+            *how,
+            *map(str, units or ()),
+            str(time),
+        }
+        answered(lambda: load(path, units, time=time, **how), words)
+
+
+parts = st.sampled_from([0.0, 1.0, -0.5, 0.707, 32767.0, 1e-300, 1e300, np.nan, np.inf])
+PLAIN = {name: np.array([0.5, -0.5]) for name in "wxyz"}
+
+
+@fuzzed
+@given(
+    columns=st.one_of(
+        st.fixed_dictionaries({name: st.lists(parts, max_size=3) for name in "wxyz"}), st.just(PLAIN), junk
+    ),
+    names=st.one_of(st.just(["w", "x", "y", "z"]), st.lists(st.sampled_from(["w", "x", 3, None]), max_size=5), junk),
+)
+def test_quaternions_of_logs(columns, names):
+    found = {}
+    said = judged(lambda: found.update(unit_quaternions(columns, names)), {"columns", "names", *"wxyz"})
+    if not said:
+        length = np.sqrt(sum(a**2 for a in found.values()))
+        assert (np.isnan(length) | (np.abs(length - 1) < 1e-12)).all() and np.isfinite(length).any()
 
 
 def test_what_is_no_path():

@@ -1,5 +1,6 @@
 """Recorded readings through on-board code: the computer knows what it knew in the closed loop; files."""
 
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import jax
@@ -7,12 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pandas
 import pytest
+from scipy.spatial.transform import Rotation
 
 from jaxatt import Now, Reading, Vec3, simulate
 from jaxatt.faults import dead_where
 from jaxatt.loops import cmg_loss, gyro_ekf, observer_pd, star_isolation, wheel_mrac
 from jaxatt.observers import AttitudeRate
-from jaxatt.replay import checked, load, replay, resample, together
+from jaxatt.replay import checked, load, replay, resample, together, unit_quaternions
 from jaxatt.sensors import read_triad
 
 KEY = jax.random.key(4)
@@ -52,6 +54,9 @@ STAR = star_isolation.scenario._replace(
 )
 CMG = cmg_loss.scenario._replace(std_w=1e-4)
 WHEEL = wheel_mrac.scenario._replace(tacho_noise=1.0, drive=wheel_mrac.Fault(onset=1.0, scale=0.5))
+SURE = gyro_ekf.consistent(gyro_ekf.params)
+P0 = np.where(np.arange(17) // 3 == 1, 1.0, SURE.P0)  # it does not know its angles at the start
+Spinning = SimpleNamespace(params=SURE._replace(P0=P0), computer_of=gyro_ekf.computer_of)
 CASES = {
     "observer_pd": Case(observer_pd, observer_pd.system, observer_pd.decide, OBSERVER,
                         lambda s, now, x, z, after, noise: after.sensors.y, observer_pd.computer_flow, observer_reads),
@@ -165,6 +170,23 @@ def test_the_loop_written_down_once_more_is_the_shipped_one():
     case = CASES["observer_pd"]
     noise = jax.random.normal(KEY, (TICKS, case.system.normals))
     close(simulate(case.system, case.loop.params, case.scenario, noise, ticks=TICKS), recorded(case).log)
+
+
+def test_angles_that_wrap_at_180_deg_are_the_angles_that_do_not():
+    """A body that turns through 180 deg: its log jumps from +180 to -180 deg, and the filter must not see it."""
+    case = CASES["gyro_ekf"]
+    spinning = case.scenario._replace(angle=Vec3(0.1, 0.02, 2e-4 - np.pi), w=Vec3(3e-4, 0.0, -4e-4))
+    case = case._replace(scenario=spinning, loop=Spinning)
+    run = recorded(case)
+    angle = run.told.angle
+    jumping = angle._replace(value=np.mod(angle.value + np.pi, 2 * np.pi) - np.pi)
+    assert np.ptp(jumping.value[:, 2]) > 6 and np.ptp(angle.value, axis=0).max() < 2
+    computers, (met, _) = replay(
+        case.decide, Spinning.params, run.start, run.told._replace(angle=jumping), dt=gyro_ekf.DT
+    )
+    close(run.computers.belief.mean, computers.belief.mean)
+    close(run.log.filter.nis, met.nis, 1e-6)
+    assert met.nis[3:].max() < 60 and np.abs(run.log.filter.error[8:, gyro_ekf.ANGLE]).max() < 1e-3
 
 
 class Lag(NamedTuple):
@@ -368,3 +390,62 @@ def test_arrays_need_no_file():
     t, columns = checked([0, 1], {"a": [1, np.nan]})
     assert t.dtype == float and np.isnan(columns["a"][1])
     assert isinstance(resample(t, columns, dt=1.0)["a"], Reading)
+
+
+# quaternions
+
+
+def logged(steps=40, scale=1.0, digits=3):
+    """A body that turns several times, as a log has it: few digits, the scalar not negative, so that signs jump."""
+    turns = Rotation.from_rotvec(np.linspace(0, 15, steps)[:, None] * [2 / 7, -3 / 7, 6 / 7])
+    q = np.roll(turns.as_quat(canonical=True), 1, axis=1)
+    q = np.round(q * scale, digits)
+    return turns, dict(zip("wxyz", q.T))
+
+
+@pytest.mark.parametrize(("scale", "digits", "off"), [(1.0, 3, 2e-3), (32767, 0, 1e-4), (1.0, 15, 1e-14)])
+def test_quaternions_of_few_digits_are_made_unit_and_continuous(scale, digits, off):
+    turns, columns = logged(scale=scale, digits=digits)
+    columns["y"][7] = np.nan
+    got = unit_quaternions(columns, list("wxyz"))
+    assert list(got) == list("wxyz")
+    q = np.stack(list(got.values()), 1)
+    assert np.isnan(q[7]).all()
+    q, turns = np.delete(q, 7, axis=0), turns[np.arange(40) != 7]
+    np.testing.assert_allclose(np.linalg.norm(q, axis=1), 1, atol=1e-15)
+    assert (np.sum(q[1:] * q[:-1], axis=1) > 0).all() and (np.diff(np.sign(columns["w"])) >= 0).any()
+    assert (turns.inv() * Rotation.from_quat(q, scalar_first=True)).magnitude().max() < off
+    assert (q[:, 0] < 0).any()  # where the log had the other sign
+
+
+def test_the_order_of_the_names_says_where_the_scalar_is():
+    _, columns = logged()
+    other = {f"q{i + 1}": columns[name] for i, name in enumerate("xyzw")}
+    first, last = unit_quaternions(columns, ["w", "x", "y", "z"]), unit_quaternions(other, ["q4", "q1", "q2", "q3"])
+    np.testing.assert_array_equal(list(first.values()), list(last.values()))
+
+
+@pytest.mark.parametrize(
+    ("change", "names", "message"),
+    [
+        ({}, ["w", "x", "y"], "`names` must be four channels"),
+        ({}, "wxyz", "`names` must be four channels"),
+        ({}, ["w", "x", "y", "q"], "`names` must be four channels"),
+        (dict(w=np.zeros(40), x=np.zeros(40), y=np.zeros(40), z=np.zeros(40)), list("wxyz"), "of length 0 in row 0"),
+        (dict(w=np.linspace(0, 3, 40)), list("wxyz"), r"`w` must belong to quaternions of one length .* in row \d+"),
+        (dict(w=np.full(40, np.nan)), list("wxyz"), "`w` must belong to one complete quaternion at least"),
+        (dict(w=np.ones(3)), list("wxyz"), "`names` must be four channels of one shape"),
+    ],
+)
+def test_what_is_no_quaternion_is_refused(change, names, message):
+    with pytest.raises(ValueError, match=message):
+        unit_quaternions(logged()[1] | change, names)
+
+
+def test_rows_of_one_time_become_one_where_no_channel_is_given_twice():
+    t, columns = checked(
+        [0, 0, 1, 1, 1, 2], {"a": [1, np.nan, np.nan, 2, np.nan, 3], "b": [np.nan, 4, 5, np.nan, np.nan, 6]}
+    )
+    assert t.tolist() == [0, 1, 2] and columns["a"].tolist() == [1, 2, 3] and columns["b"].tolist() == [4, 5, 6]
+    with pytest.raises(ValueError, match="`time` must increase from row to row, but it is 0 after 0 in row 1"):
+        checked([0, 0, 1], {"a": [1, 2, 3], "b": [np.nan, 4, 5]})

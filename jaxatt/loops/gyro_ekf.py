@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxatt import check, scores
-from jaxatt.attitude import euler_body_rate, euler_rate
+from jaxatt.attitude import euler_body_rate, euler_rate, full_turn, wrapped
 from jaxatt.bodies import body_acceleration
 from jaxatt.check import acute, finite, flag, inertia, instant, limit, not_negative, positive, share
 from jaxatt.contract import System
@@ -39,6 +39,9 @@ INTEGRAL, ANGLE, RATE, WHEEL, BIAS = (slice(0, 3), slice(3, 6), slice(6, 9), sli
 GYRO = slice(3, 7)  # of the measurements: 3 angles, 4 gyros, 4 tachometers
 STATE = "rad s, rad, rad/s, in-lbf-s, rad/s"  # units of the filter's state
 MEASURED = "rad, rad/s, in-lbf-s"  # units of the measurements
+TURN = full_turn("rad")
+ANGLES_MEASURED = np.repeat([TURN, np.inf], [3, 8])  # one turn of the measurements that are angles
+ANGLES_ESTIMATED = np.repeat([np.inf, TURN, np.inf], [3, 3, 11])  # and of the states
 
 
 class Params(NamedTuple):
@@ -174,7 +177,8 @@ class Log(NamedTuple):
 
 def init_truth(scenario: Scenario, computer):
     """x, z at the start."""
-    x = X(zeros(), scenario.angle, scenario.w, scenario.h)
+    # within half a turn of the filter's start, for its integral and the true one are those of one and the same angle
+    x = X(zeros(), Vec3(*map(wrapped, scenario.angle)), scenario.w, scenario.h)
     no = jnp.zeros(4, bool)
     gyro = project(gyro_pyramid(scenario.alpha, scenario.beta), x.w) + scenario.bias
     readings = Readings(Reading(array(x.angle), no[:3]), Reading(gyro, no), Reading(x.h, no), jnp.ones(4), jnp.zeros(3))
@@ -250,10 +254,16 @@ def target(params: Params, t) -> Target:
     return Target(params.slew * (s * s / 2 + span * after), angle, euler_body_rate(angle, rate))
 
 
+def angle_error(angle: Vec3, of: Vec3) -> Vec3:
+    """Difference of angles [rad], each modulo a turn."""
+    return Vec3(*map(wrapped, angle - of))
+
+
 def command(params: Params, now, up, integral: Vec3, angle: Vec3, w: Vec3):
     """Rates of wheel momentum u (4,) [in-lbf] for the torque of the PID law (5), shared among the wheels that are up."""
     aim = target(params, now.t)
-    torque = pid(angle - aim.angle, integral - aim.integral, w - aim.w, params.k_f, params.k_p, params.k_i, params.k_d)
+    errors = angle_error(angle, aim.angle), integral - aim.integral, w - aim.w
+    torque = pid(*errors, params.k_f, params.k_p, params.k_i, params.k_d)
     return jnp.clip(allocation(-torque, park_pyramid(params.gamma), up), -params.torque_max, params.torque_max)
 
 
@@ -293,7 +303,7 @@ def decide(params: Params, now, computer: Computer, y: Readings):
     gyro = jnp.where(known, y.gyro.value, jnp.stack(gyros_read(params, prior.mean)))
     value = jnp.concatenate([y.angle.value, gyro, y.tacho.value])
     valid = jnp.concatenate([y.angle.valid, known | (params.fill > 0), y.tacho.valid]) & (now.k > 0)
-    belief, met = update(prior, Reading(value, valid), partial(measured, params), params.R)
+    belief, met = update(prior, Reading(value, valid), partial(measured, params), params.R, ANGLES_MEASURED)
 
     state = [Vec3.of(belief.mean[part]) for part in (INTEGRAL, ANGLE, RATE)]
     u = every(CONTROL, now, lambda: command(params, now, y.up, *state), computer.u)
@@ -355,7 +365,8 @@ def tick(params: Params, scenario: Scenario, now, x: X, z: Z, noise):
     mean, cov = belief = computer.belief
     truth = jnp.concatenate([array(x.integral), array(x.angle), array(x.w), x.h, scenario.bias])
     tested = suspicion.gyro, suspicion.parity, computer.dropped
-    kept = FilterLog(mean, jnp.diagonal(cov), truth - mean, nees(belief, truth), met.nis, met.rows, met.nll, *tested)
+    error, squared = wrapped(truth - mean, ANGLES_ESTIMATED), nees(belief, truth, ANGLES_ESTIMATED)
+    kept = FilterLog(mean, jnp.diagonal(cov), error, squared, met.nis, met.rows, met.nll, *tested)
     return x, Z(readings, computer, motors(scenario, now), z.wheels), report(params, now, x, computer.u, kept)
 
 
@@ -368,7 +379,8 @@ def tick_direct(params: Params, scenario: Scenario, now, x: X, z: Z, noise):
 
 def report(params: Params, now, x: X, u, filter_log) -> Log:
     """The log of one tick; u: (4,) commanded rates [in-lbf]; filter_log: `FilterLog` or None."""
-    return Log(now.t, x.integral, x.angle, x.angle - target(params, now.t).angle, x.w, x.h, u, filter_log)
+    error = angle_error(x.angle, target(params, now.t).angle)
+    return Log(now.t, x.integral, x.angle, error, x.w, x.h, u, filter_log)
 
 
 BAND = 0.01 * DEG  # [rad] pointing band of the settling time
