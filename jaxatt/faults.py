@@ -37,6 +37,7 @@ class Fault(NamedTuple):
     scale: Annotated[Any, "1", a_number] = 1.0  # factor on the true signal: scale-factor error, loss of effectiveness
     growth: Annotated[Any, "1", not_negative] = 1.0  # factor on the channel's own noise
     stuck: Annotated[Any, "1", flag] = 0.0  # 1: the reading stays at the last one before the onset
+    missing: Annotated[Any, "1", flag] = 0.0  # 1: there is no reading; its value, not valid, stays at the last one
 
     def check(self, name: str) -> None:
         """Refuse, with ValueError, a fault that ends before its onset."""
@@ -68,6 +69,21 @@ class Reading(NamedTuple):
 
     value: Any  # [unit of the channel]
     valid: Any  # bool: what is not valid is not used, whatever its value
+
+
+def present(reading: Reading):
+    """Whether a reading is there: valid, and finite in all that one flag stands for, such as a `Vec3`; as its flag."""
+    return jax.tree.map(
+        lambda valid, value: valid & jnp.isfinite(sum(jax.tree.leaves(value))), reading.valid, reading.value
+    )
+
+
+def known(reading: Reading, otherwise):
+    """The reading where it is `present`, else ``otherwise``, what is believed without it; no NaN enters a gradient."""
+    return jax.tree.map(
+        lambda there, value, other: jax.tree.map(lambda a, b: jnp.where(there, a, b), value, other),
+        present(reading), reading.value, otherwise,
+    )  # fmt: skip
 
 
 def dead(onset: Any = 0.0, end: Any = jnp.inf) -> Fault:
@@ -102,6 +118,11 @@ def active(fault: Fault, t):
     return (t >= fault.onset) & (t < fault.end)
 
 
+def heard(fault: Fault, t):
+    """Whether the channel gives a reading at t [s]."""
+    return jnp.logical_not(active(fault, t) & (fault.missing > 0))
+
+
 def any_active(faults, t):
     """Whether any of the faults, any tree that holds some, is on at t [s]."""
     return reduce(jnp.logical_or, [active(f, t) for f in faults_of(faults)])
@@ -117,17 +138,17 @@ def channel(fault: Fault, t, std, normal, last) -> Channel:
 
     std: standard deviation of its noise [unit of the channel]; normal: a standard normal number, which serves the noise
     and ``fault.random`` together, for the sum of two Gaussian signals is one; last: the previous reading, which a stuck
-    channel repeats.
+    channel repeats, and a missing one: whether it is valid tells `heard`.
     """
     on = active(fault, t)
-    stuck = on & (fault.stuck > 0)
+    held = on & ((fault.stuck > 0) | (fault.missing > 0))
     since = jnp.where(on, t - fault.onset, 0)
     grown = fault.growth * std
     spread = safe_sqrt(grown * grown + fault.random * fault.random)
     faulty = fault.bias + fault.drift * (1 - jnp.exp(-since / fault.tau)) + spread * normal
     return Channel(
-        gain=jnp.where(stuck, 0, jnp.where(on, fault.scale, 1)),
-        offset=jnp.where(stuck, last, jnp.where(on, faulty, std * normal)),
+        gain=jnp.where(held, 0, jnp.where(on, fault.scale, 1)),
+        offset=jnp.where(held, last, jnp.where(on, faulty, std * normal)),
     )
 
 

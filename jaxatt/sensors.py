@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxatt.faults import Reading, channel, read
+from jaxatt.faults import Reading, channel, heard, present, read
 from jaxatt.vec import Vec3, array, columns, cross, resultant
 
 
@@ -25,6 +25,12 @@ def triad(faults: Vec3, t, std, normals, last: Vec3) -> Vec3:
 def read_triad(channels: Vec3, truth: Vec3) -> Vec3:
     """The reading of a triad whose true signals are ``truth``."""
     return Vec3(*map(read, channels, truth))
+
+
+def heard_triad(faults: Vec3, t):
+    """Whether a triad gives a reading at t [s]: it counts as a whole, and is missing where one of its channels is."""
+    x, y, z = (heard(f, t) for f in faults)
+    return x & y & z
 
 
 def quantised(y, step):
@@ -68,6 +74,7 @@ def rate_maps(axes):
 
 
 def rate_from(maps, gyro: Reading) -> Vec3:
-    """The body rate [rad/s] that explains the valid ones of n gyro readings (n,) best; maps: of `rate_maps`."""
-    subset = sum(valid << i for i, valid in enumerate(gyro.valid.astype(int)))
-    return resultant(maps[subset], jnp.where(gyro.valid, gyro.value, 0))
+    """The body rate [rad/s] that explains the valid, finite ones of n gyro readings (n,) best; maps: of `rate_maps`."""
+    there = present(gyro)
+    subset = sum(valid << i for i, valid in enumerate(there.astype(int)))
+    return resultant(maps[subset], jnp.where(there, gyro.value, 0))

@@ -15,10 +15,13 @@ from jaxatt.faults import (
     faults_of,
     first_onset,
     healthy,
+    heard,
+    known,
     on_axes,
+    present,
     read,
 )
-from jaxatt.sensors import read_triad, triad
+from jaxatt.sensors import heard_triad, read_triad, triad
 from jaxatt.vec import Vec3
 
 TRUTH, STD, NORMAL, LAST = 2.0, 0.1, 1.5, -7.0
@@ -115,3 +118,35 @@ def test_those_of_a_mask_are_dead_from_the_onset_on():
     assert all(np.shape(leaf) == (3,) for leaf in jax.tree.leaves(fault))
     for t, kept in ((4.9, [1, 1, 1]), (5.0, [1, 0, 1]), (1e6, [1, 0, 1])):
         np.testing.assert_array_equal(read(channel(fault, t, 0.0, 0.0, 0.0), 7.0), 7.0 * np.array(kept))
+
+
+# missing readings
+
+
+def test_a_missing_channel_is_not_heard_and_holds_its_last_reading():
+    gap = Fault(onset=4.0, end=9.0, missing=1.0, bias=0.3)
+    for t, there in ((3.9, True), (4.0, False), (8.9, False), (9.0, True)):
+        assert bool(heard(gap, t)) == there
+        assert reading(gap, t) == pytest.approx(NOISY if there else LAST)
+    assert bool(heard(Fault(), 1e9)) and bool(heard(Fault(stuck=1.0), 5.0))
+    triad_ = Vec3(Fault(), gap, Fault())
+    assert not bool(heard_triad(triad_, 5.0)) and bool(heard_triad(triad_, 9.0))
+    with pytest.raises(ValueError, match=r"`gyro\.missing` must be one of \(0, 1\), but it is 2\."):
+        fields.validate("gyro", Fault(missing=2.0))
+
+
+def test_known_is_the_reading_where_it_is_present():
+    """One flag for an array, for a vector, for each of two vectors; NaN and inf are missing; gradients are finite."""
+    value = np.array([1.0, np.nan, 3.0, np.inf, 5.0])
+    valid = np.array([1, 1, 0, 1, 1], bool)
+    np.testing.assert_array_equal(present(Reading(value, valid)), [1, 0, 0, 0, 1])
+    np.testing.assert_array_equal(known(Reading(value, valid), 7.0 + np.zeros(5)), [1, 7, 7, 7, 5])
+    other = Vec3(7.0, 8.0, 9.0)
+    assert known(Reading(Vec3(1.0, 2.0, 3.0), True), other) == (1, 2, 3)
+    for gone in (Reading(Vec3(1.0, 2.0, 3.0), False), Reading(Vec3(1.0, jnp.nan, 3.0), True)):
+        assert known(gone, other) == other
+    two = Reading(Vec3(*np.array([[1.0, 2.0], [3.0, np.nan], [5.0, 6.0]])), np.ones(2, bool))
+    np.testing.assert_array_equal(present(two), [1, 0])
+    np.testing.assert_array_equal(known(two, Vec3(*np.zeros((3, 2)))), [[1, 0], [3, 0], [5, 0]])
+    slope = jax.grad(lambda a, b: known(Reading(a + jnp.nan, True), b), argnums=(0, 1))(2.0, 3.0)
+    assert slope == (0, 1)

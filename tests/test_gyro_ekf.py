@@ -383,7 +383,7 @@ def test_the_suspicion_is_that_of_plain_matrices():
         )
         got = gyro_ekf.suspect(p, at(k, k * DT), computer, Belief(x, P), readings)
         usable = np.array([1, 0, third, 1, third]) * (k > 0)  # the second is dropped: its parity is still told
-        moved = mean + 0.3 * (usable * np.r_[normal, parity] - mean)
+        moved = mean + 0.3 * usable * (np.r_[normal, parity] - mean)  # what is missing moves nothing
         np.testing.assert_allclose(got.mean, moved, rtol=1e-9)
         np.testing.assert_allclose([*got.gyro, got.parity], moved**2 * 1.7 / 0.3, rtol=1e-9)
 
@@ -450,6 +450,7 @@ def test_scores_are_those_of_a_made_up_log(kept):
         three(1.0),
         rng.normal(size=(9, 4)),
         rng.normal(size=(9, 4)),
+        three(1.0),
         f if kept else None,
     )
     got = tallied(gyro_ekf.score, params._replace(threshold=0.8), gyro_ekf.scenario, log, dt)

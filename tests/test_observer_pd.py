@@ -13,7 +13,7 @@ from jaxatt.bodies import body_acceleration
 from jaxatt.contract import Now
 from jaxatt.controllers import rate_gain_floor
 from jaxatt.engine import rk4
-from jaxatt.faults import Channel
+from jaxatt.faults import Channel, Reading
 from jaxatt.loops import observer_pd as op
 from jaxatt.observers import AttitudeRate
 from jaxatt.vec import Mat3, Vec3, array, cross, norm, zeros
@@ -82,8 +82,8 @@ def test_every_reading_has_noise_of_its_own():
     x, z = op.init(op.params, scenario)
     noise = np.arange(1.0, 7.0)
     sensors = op.sense(op.params, scenario, Now(jnp.asarray(3), jnp.asarray(3.0), 1.0), x, z, jnp.asarray(noise))
-    np.testing.assert_allclose(array(sensors.y.q), array(scenario.q) + 0.1 * noise[:3], rtol=1e-12)
-    np.testing.assert_allclose(array(sensors.y.w), array(scenario.w) + 0.2 * noise[3:], rtol=1e-12)
+    np.testing.assert_allclose(array(sensors.y.q.value), array(scenario.q) + 0.1 * noise[:3], rtol=1e-12)
+    np.testing.assert_allclose(array(sensors.y.w.value), array(scenario.w) + 0.2 * noise[3:], rtol=1e-12)
 
 
 def test_momentum_is_conserved_by_eulers_sign_only():
@@ -237,3 +237,37 @@ def test_scores_are_those_of_a_made_up_log():
     }  # fmt: skip
     for name in op.Scores._fields:
         np.testing.assert_allclose(getattr(got, name), found[name], rtol=1e-12, err_msg=name)
+
+
+@pytest.mark.parametrize("gone", [Reading(Vec3(np.nan, 0.1, 0.2), True), Reading(Vec3(9.0, 9.0, 9.0), False)])
+def test_without_readings_the_observer_predicts_and_nothing_alarms(gone):
+    """The estimate moves by the model alone, on the torque of its own errors; beyond half a turn it changes its set."""
+    rng, p, J = np.random.default_rng(3), op.params, array(op.INERTIA)
+    q, w = np.array([0.4, -0.2, 0.3]), rng.normal(size=3)
+    computer, y = op.Computer(AttitudeRate(Vec3(*q), Vec3(*w)), 80.0), AttitudeRate(gone, gone)
+    rate = op.computer_flow(p, computer, y)["estimate"]
+    S = np.array([[0, -q[2], q[1]], [q[2], 0, -q[0]], [-q[1], q[0], 0]])
+    G = ((1 - q @ q) * np.eye(3) + 2 * S + 2 * np.outer(q, q)) / 4
+    u = -p.k_q * q - 80.0 * w
+    np.testing.assert_allclose(array(rate.q), G @ w, rtol=1e-12)
+    np.testing.assert_allclose(array(rate.w), np.linalg.solve(J, u - np.cross(w, J @ w)), rtol=1e-12)
+    far = computer._replace(estimate=AttitudeRate(Vec3(*(3 * q / np.linalg.norm(q))), Vec3(*w)))
+    now = Now(jnp.asarray(5), 0.5, 0.1)
+    after, (xi, alarmed) = op.decide(p, now, far, y)
+    assert xi == 0 and not alarmed
+    np.testing.assert_allclose(array(after.estimate.q), -q / np.linalg.norm(q) / 3, rtol=1e-12)
+    half = op.decide(p, now, computer, y._replace(q=Reading(Vec3(*(q + 0.01)), True)))[1]
+    np.testing.assert_allclose(half[0], 0.01 * np.sqrt(3), rtol=1e-9)  # the attitude alone
+
+
+def test_a_run_goes_through_an_outage_on_its_estimate():
+    """2 s of no readings: the noiseless loop with the believed inertia does not notice; with noise nothing alarms."""
+    gap = on_axes(Fault(onset=1.0, end=3.0, missing=1.0))
+    run = jax.jit(lambda s: simulate(op.system, op.params, s, KEY, ticks=60))
+    told, blind = (
+        run(jax.tree.map(lambda a: jnp.asarray(a, float), s)) for s in (QUIET, QUIET._replace(star=gap, gyro=gap))
+    )
+    for a, b in ((told.q, blind.q), (told.w, blind.w), (told.u, blind.u), (told.estimate.w, blind.estimate.w)):
+        np.testing.assert_allclose(b, a, atol=1e-6)  # RK4 of estimate and truth
+    noisy = run(jax.tree.map(lambda a: jnp.asarray(a, float), op.scenario._replace(star=gap, gyro=gap)))
+    assert not noisy.alarm.any() and (noisy.xi[10:30] == 0).all() and (noisy.xi[30:] > 0).all()

@@ -36,12 +36,14 @@ class Case(NamedTuple):
 
 
 def observer_reads(scenario, x, z):
-    return AttitudeRate(read_triad(z.sensors.star, x.q), read_triad(z.sensors.gyro, x.w))
+    values = read_triad(z.sensors.star, x.q), read_triad(z.sensors.gyro, x.w)
+    return AttitudeRate(*(told._replace(value=a) for told, a in zip(z.sensors.y, values)))
 
 
 def wheel_reads(scenario, x, z):
     y = wheel_mrac.tachometer(scenario, z.sensors.tacho, x.y)
-    return wheel_mrac.Readings(z.sensors.readings.theta, y)
+    theta, told = z.sensors.readings
+    return wheel_mrac.Readings(theta, told._replace(value=y))
 
 
 OBSERVER = observer_pd.scenario._replace(

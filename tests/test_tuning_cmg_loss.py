@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from experiments.tuning import cmg_loss as study
-from jaxatt import Now, Vec3
+from jaxatt import Now, Reading, Vec3
 from jaxatt.loops import cmg_loss as cmg
 
 
@@ -39,11 +39,12 @@ def test_a_design_keeps_its_bounds():
 def test_commands_have_the_slopes_of_their_values():
     days = study.days(study.momenta(study.TUNE, 1), np.zeros((2, 3)))
     gamma_0, healthy = days.gamma[0], np.array([1.0, 1, 1, 0])
-    computer = cmg.Computer(Vec3(0.01, 0.0, -0.02), np.zeros(4))
+    computer = cmg.Computer(Vec3(0.01, 0.0, -0.02), np.zeros(4), Vec3(0.0, 0.0, 0.0), np.zeros(4))
 
     def commands(theta):
         params, shift = study.design(theta)
-        readings = cmg.Readings(Vec3(0.03, -0.02, 0.01), gamma_0 + jnp.append(shift[0], 0), healthy)
+        gamma = Reading(gamma_0 + jnp.append(shift[0], 0), np.ones(4, bool))
+        readings = cmg.Readings(Reading(Vec3(0.03, -0.02, 0.01), True), gamma, healthy)
         return cmg.decide(params, Now(0, 0.3, 0.01), computer, readings)[0].u
 
     along = np.random.default_rng(2).normal(size=study.START.size)

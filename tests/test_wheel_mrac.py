@@ -18,7 +18,7 @@ from experiments.wheel_mrac import HARDWARE, HARDWARE_DAY, normals_of  # noqa: E
 from jaxatt import scores  # noqa: E402
 from jaxatt.contract import Now  # noqa: E402
 from jaxatt.controllers import Adaptation, Mrac, mrac_flow, mrac_input, mrac_sampled_bound, mrac_step  # noqa: E402
-from jaxatt.faults import Fault  # noqa: E402
+from jaxatt.faults import Fault, Reading  # noqa: E402
 from jaxatt.loops import wheel_mrac as wm  # noqa: E402
 from jaxatt.observers import LeastSquares, least_squares  # noqa: E402
 from jaxatt.sweeping import varied  # noqa: E402
@@ -590,13 +590,15 @@ def test_one_tick_draws_and_holds_what_the_channels_say(uniform, unit):
     )  # fmt: skip
     x, z = jax.tree.map(jnp.asarray, wm.init(wm.params, day))
     x = x._replace(theta=jnp.asarray(5.0), y=jnp.asarray(7.0))
-    readings = wm.Readings(jnp.asarray(99.0), jnp.asarray(55.0))
-    assert z.sensors.line.shape == last.shape
-    z = z._replace(sensors=z.sensors._replace(line=jnp.asarray(last), readings=readings))
+    readings = wm.Readings(Reading(jnp.asarray(99.0), True), Reading(jnp.asarray(55.0), True))
+    assert z.sensors.line.value.shape == z.sensors.line.valid.shape == last.shape
+    line = z.sensors.line._replace(value=jnp.asarray(last))
+    z = z._replace(sensors=z.sensors._replace(line=line, readings=readings))
     now = Now(jnp.asarray(50), jnp.asarray(1.0), wm.DT)
     _, after, _ = wm.system.tick(wm.params, day, now, x, z, noise)
-    np.testing.assert_allclose(after.sensors.line, [5 + 0.05 * unit, *last[:-1]], rtol=1e-12)
-    np.testing.assert_allclose(after.sensors.readings, [last[2], 7 - 2 * 0.7], rtol=1e-12)  # three ticks ago
+    np.testing.assert_allclose(after.sensors.line.value, [5 + 0.05 * unit, *last[:-1]], rtol=1e-12)
+    told = lambda after: [reading.value for reading in after.sensors.readings]
+    np.testing.assert_allclose(told(after), [last[2], 7 - 2 * 0.7], rtol=1e-12)  # three ticks ago
     np.testing.assert_allclose(after.drive, [0.8, 3 * 1.1], rtol=1e-12)
     np.testing.assert_allclose(after.friction, 0.5 * 10 + 30, rtol=1e-12)
     stuck = Fault(onset=0.5, stuck=1.0)
@@ -604,8 +606,8 @@ def test_one_tick_draws_and_holds_what_the_channels_say(uniform, unit):
     _, after, _ = wm.system.tick(
         wm.params, day, now, x, z._replace(memory=z.memory._replace(u=jnp.asarray(44.0))), noise
     )
-    np.testing.assert_allclose(after.sensors.line[0], last[0])
-    np.testing.assert_allclose(after.sensors.readings, [last[-2], 55.0])  # as late as can be
+    np.testing.assert_allclose(after.sensors.line.value[0], last[0])
+    np.testing.assert_allclose(told(after), [last[-2], 55.0])  # as late as can be
     np.testing.assert_allclose(after.drive, [0.0, 44.0])
     wm.system.check(wm.params, day._replace(delay=(1 + 1e-12) * wm.DELAYS * wm.DT))  # no more than rounding: it passes
 
@@ -678,3 +680,41 @@ def test_span_of_a_window():
     ]
     assert (parts[0] + parts[1] + parts[2]).value() == 4.0
     assert np.isnan(parts[1].value())
+
+
+@pytest.mark.parametrize("gone", [Reading(np.nan, True), Reading(999.0, False)])
+def test_what_is_missing_moves_no_parameter_and_raises_no_alarm(gone):
+    """The attitude is expected from the wheel's turns, the wheel speed from the reference model."""
+    p = wm.params._replace(blend=0.3, forget=0.1)
+    mrac, dt = Mrac(700.0, 0.9, 0.3), wm.DT
+    memory = wm.Memory(LeastSquares(-1e-4, 1e-7), 650.0, 0.0, 12.0, True, -1000.0, 0.1)
+    computer, now = wm.Computer(mrac, -1010.0, memory), Now(jnp.asarray(9), 0.18, dt)
+    blind, (residual, alarmed, flipped) = wm.decide_sampled(p, now, computer, wm.Readings(gone, gone))
+    known = blind.memory
+    assert residual == 0 and not alarmed and not flipped and not known.fresh
+    np.testing.assert_allclose(known.estimate, [-1e-4, 1e-7 * np.exp(0.1 * dt)], rtol=1e-12)  # it forgets, no more
+    np.testing.assert_allclose([known.theta, known.predicted], [12.0 + 1e-3, 0.101], rtol=1e-12)
+    np.testing.assert_allclose([blind.mrac.a_r, blind.mrac.a_y], [0.9, 0.3], rtol=1e-12)
+    np.testing.assert_allclose(known.u, 0.9 * known.r + 0.3 * 700.0, rtol=1e-12)
+    for flow in (wm.computer_flow, wm.computer_flow_sampled):
+        rate = flow(p, blind, wm.Readings(gone, gone))
+        assert rate["turns"] == 700.0 and rate["mrac"].a_r == 0 == rate["mrac"].a_y
+    rated = p._replace(differenced=1.0)
+    read = wm.Readings(Reading(12.5, True), Reading(700.0, True))
+    again = wm.decide(rated, now, blind, read)[0].memory  # no rate of readings over a gap
+    assert again.fresh and again.theta == 12.5 and again.estimate.a == known.estimate.a
+    assert (
+        wm.decide(rated, now, blind._replace(memory=again, turns=-1030.0), read)[0].memory.estimate.a
+        != again.estimate.a
+    )
+
+
+def test_a_late_reading_is_missing_when_it_was_taken_in_the_gap():
+    day = wm.scenario._replace(delay=2.5 * wm.DT, attitude=Fault(onset=1.0, end=1.0 + wm.DT, missing=1.0))
+    x, z = wm.init(wm.params, day)
+    there = []
+    for k in range(48, 56):
+        sensors = wm.sense(wm.params, day, Now(k, k * wm.DT, wm.DT), x, z, np.zeros(3))
+        z = z._replace(sensors=sensors)
+        there.append(bool(sensors.readings.theta.valid))
+    assert there == [True, True, True, True, False, False, True, True]  # ticks 52 and 53 read between 49.5 and 50.5

@@ -31,6 +31,8 @@ from jaxatt.cmg import (
 )
 from jaxatt.contract import System
 from jaxatt.engine import every
+from jaxatt.faults import Fault, Reading, known, on_axes
+from jaxatt.sensors import heard_triad, read_triad, triad
 from jaxatt.torque_matrix import condition_and_rank
 from jaxatt.vec import Mat3, Quat, Vec3, cross, inverse, norm, zeros
 
@@ -51,7 +53,9 @@ class Params(NamedTuple):
     k_i: Annotated[Any, "1/s^2", not_negative] = 0.02  # integral gain of Table 4, against Table 5 (erratum 7): `table5`
     steering: Steering = Steering()
     axes: GimbalAxes = PYRAMID  # believed mounting of the n modules
-    J: Annotated[Mat3, "kg m^2", inertia] = INERTIA  # believed, of the spacecraft without modules
+    J: Annotated[Mat3, "kg m^2", inertia] = (
+        INERTIA  # believed, without modules; products are the entries, J.x.y = -sum(m x y)
+    )
     module: ModuleInertia = MODULE  # believed
     spin: Annotated[Any, "rad/s", positive] = SPIN  # believed wheel speed: h_w = I_ws spin
 
@@ -77,19 +81,20 @@ class Scenario(NamedTuple):
     rate: Annotated[Any, "rad/s", finite, ("n",)] = np.zeros(4)  # initial gimbal rates
     spin: Annotated[Any, "rad/s", finite, ("n",)] = np.full(4, SPIN)  # wheel speeds
     h: Annotated[Vec3, "N m s", finite] = Vec3(0.0, 0.0, 0.0)  # total momentum at the start; it sets the body rate
-    J: Annotated[Mat3, "kg m^2", inertia] = INERTIA  # true, of the spacecraft without modules
+    J: Annotated[Mat3, "kg m^2", inertia] = INERTIA  # true, of the spacecraft without modules, likewise
     module: ModuleInertia = MODULE  # true
     tau_g: Annotated[Any, "s", positive] = 0.05  # lag of the gimbal rates
     u_max: Annotated[Any, "rad/s", limit] = 1.0  # limit of the gimbal rates; printed with rad/s^2 (erratum 3)
-    std_w: Annotated[Any, "rad/s", not_negative] = 0.0  # gyro noise per axis
+    std_w: Annotated[Any, "rad/s", not_negative] = 0.0  # gyro noise per axis and sample, one a tick
     bias_w: Annotated[Vec3, "rad/s", finite] = Vec3(0.0, 0.0, 0.0)  # gyro bias
+    gyro: Annotated[Vec3, "rad/s"] = on_axes(Fault())  # faults per axis
 
 
 class Readings(NamedTuple):
     """What the on-board computer gets."""
 
-    w: Vec3  # [rad/s] gyro
-    gamma: Any  # (n,) [rad] gimbal angles
+    w: Reading  # [rad/s] gyro, a `Vec3`
+    gamma: Reading  # (n,) [rad] gimbal angles
     healthy: Any  # (n,) 1 or 0: telemetry of the modules
 
 
@@ -98,6 +103,8 @@ class Computer(NamedTuple):
 
     integral: Vec3  # [rad] of the rate error
     u: Any  # (n,) [rad/s] gimbal-rate commands before the limit
+    w: Vec3  # [rad/s] last reading of the gyro
+    gamma: Any  # (n,) [rad] last readings of the gimbal angles
 
 
 class Drive(NamedTuple):
@@ -169,13 +176,15 @@ def init(params: Params, scenario: Scenario):
     J_T = cluster_inertia(s.J, at, s.module)
     w = inverse(J_T) @ (s.h - cluster_momentum(zeros(), s.rate, s.spin, at, J_T, s.module))
     x = X(Quat(1.0, 0.0, 0.0, 0.0), w, s.gamma, s.rate, s.spin)
-    return x, Z(Computer(zeros(), none), Drive(none, none, none), s.rate, norm(w))
+    return x, Z(Computer(zeros(), none, w, s.gamma), Drive(none, none, none), s.rate, norm(w))
 
 
 def sense(params: Params, scenario: Scenario, now, x: X, z: Z, noise) -> Readings:
     """What is read now; noise: 3 normals for the gyro."""
-    w = x.w + scenario.bias_w + scenario.std_w * Vec3.of(noise)
-    return Readings(w, x.gamma, jnp.where(failed(scenario, now), 0.0, jnp.ones_like(x.gamma)))
+    gyro = triad(scenario.gyro, now.t, scenario.std_w, noise, z.computer.w)
+    w = Reading(read_triad(gyro, x.w + scenario.bias_w), heard_triad(scenario.gyro, now.t))
+    gamma = Reading(x.gamma, jnp.ones(x.gamma.shape, bool))
+    return Readings(w, gamma, jnp.where(failed(scenario, now), 0.0, jnp.ones_like(x.gamma)))
 
 
 def failed(scenario: Scenario, now):
@@ -189,17 +198,21 @@ def computer_of(x: X, z: Z) -> Computer:
 
 
 def decide(params: Params, now, computer: Computer, y: Readings):
-    """One tick on board: every `PERIOD` ticks PI control and steering. Returns computer and no log."""
+    """One tick on board: every `PERIOD` ticks PI control and steering. Returns computer and no log.
+
+    For what is missing the last reading stands.
+    """
+    w, gamma = known(y.w, computer.w), known(y.gamma, computer.gamma)
 
     def control():
-        e = -y.w
+        e = -w
         integral = computer.integral + PERIOD * now.dt * e  # the present sample included
-        J_T = cluster_inertia(params.J, cmg_triads(params.axes, y.gamma), params.module)
+        J_T = cluster_inertia(params.J, cmg_triads(params.axes, gamma), params.module)
         torque = rate_pi(e, integral, J_T, params.k_p, params.k_i)
         a = -torque / (params.module.I_ws * params.spin)  # eq. (7): the gimbals give -h_w T rate
-        return Computer(integral, steer(params.steering, a, params.axes, y.gamma, y.healthy, now.t))
+        return integral, steer(params.steering, a, params.axes, gamma, y.healthy, now.t)
 
-    return every(PERIOD, now, control, computer), ()
+    return Computer(*every(PERIOD, now, control, (computer.integral, computer.u)), w, gamma), ()
 
 
 def tick(params: Params, scenario: Scenario, now, x: X, z: Z, noise):

@@ -23,7 +23,7 @@ from jaxatt.contract import System
 from jaxatt.controllers import pid
 from jaxatt.detection import chi_square, smoothed, worst_above
 from jaxatt.engine import every
-from jaxatt.faults import Channel, Fault, Reading, active, channel, healthy, read
+from jaxatt.faults import Channel, Fault, Reading, active, channel, healthy, heard, known, present, read
 from jaxatt.filters import Belief, innovation, nees, predict, update
 from jaxatt.sensors import gyro_pyramid, parity_vector, rate_from, rate_maps
 from jaxatt.vec import Mat3, Vec3, array, cross, inverse, largest, project, resultant, zeros
@@ -51,7 +51,9 @@ class Params(NamedTuple):
     k_p: Annotated[Vec3, "in-lbf/rad", finite] = Vec3(364.5, 364.5, 52.0)  # Table 3
     k_i: Annotated[Vec3, "in-lbf/(rad s)", finite] = Vec3(2.78125, 2.78125, 0.58984)  # Table 3
     k_d: Annotated[Vec3, "in-lbf s/rad", finite] = Vec3(11504.0, 11504.0, 1152.0)  # Table 3
-    J: Annotated[Mat3, "in-lbf-s^2", inertia] = INERTIA  # believed inertia
+    J: Annotated[Mat3, "in-lbf-s^2", inertia] = (
+        INERTIA  # believed inertia; products are the entries, J.x.y = -sum(m x y)
+    )
     alpha: Annotated[Any, "rad", acute] = 54.7 * DEG  # believed gyro pyramid, Table 2
     beta: Annotated[Any, "rad", acute] = 60.0 * DEG
     gamma: Annotated[Any, "rad", acute] = 45.0 * DEG  # believed wheel pyramid, Table 2
@@ -83,14 +85,15 @@ class Scenario(NamedTuple):
     h: Annotated[Any, "in-lbf-s", finite, (4,)] = np.array([-10.0, 5.0, 10.0, -15.0])  # initial wheel momenta
     bias: Annotated[Any, "rad/s", finite, (4,)] = np.array([0.02, -0.01, 0.01, -0.02]) * DEG  # gyro biases
     gyro: Annotated[Fault, "rad/s", (), (4,)] = Fault()  # of the gyros; a field holds one number for all or four
+    tacho: Annotated[Fault, "in-lbf-s", (), (4,)] = Fault()  # of the tachometers; likewise
     wheel: Annotated[Fault, "in-lbf", (), (4,)] = Fault()  # of the wheels' torque; likewise
     sun: Annotated[Fault, "rad"] = Fault()  # outage of the angle about x, while active
     earth: Annotated[Fault, "rad"] = Fault()  # outage of the angles about y and z, while active
     announced: Annotated[Any, "1", flag] = 1.0  # 1: the computer is told which gyros and wheels are faulty, 0: not
-    std_angle: Annotated[Any, "rad", not_negative] = 1e-4  # sensor noise, Table 5
-    std_gyro: Annotated[Any, "rad/s", not_negative] = 1e-6
-    std_tacho: Annotated[Any, "in-lbf-s", not_negative] = 1e-4
-    J: Annotated[Mat3, "in-lbf-s^2", inertia] = INERTIA  # true inertia
+    std_angle: Annotated[Any, "rad", not_negative] = 1e-4  # sensor noise per sample, one a tick, Table 5
+    std_gyro: Annotated[Any, "rad/s", not_negative] = 1e-6  # the same: angle random walk / sqrt(DT)
+    std_tacho: Annotated[Any, "in-lbf-s", not_negative] = 1e-4  # the same, per sample
+    J: Annotated[Mat3, "in-lbf-s^2", inertia] = INERTIA  # true inertia, likewise
     alpha: Annotated[Any, "rad", acute] = 54.7 * DEG  # true gyro pyramid
     beta: Annotated[Any, "rad", acute] = 60.0 * DEG
     gamma: Annotated[Any, "rad", acute] = 45.0 * DEG  # true wheel pyramid
@@ -123,6 +126,7 @@ class DirectComputer(NamedTuple):
     """What the computer without a filter remembers."""
 
     u: Any  # (4,) [in-lbf]
+    angle: Any  # (3,) [rad] last readings
     maps: Any  # (16, 3, 4) pseudo-inverse of the gyro axes for every subset of gyros in use
 
 
@@ -169,6 +173,7 @@ class Log(NamedTuple):
     w: Annotated[Vec3, "rad/s"]
     h: Annotated[Any, "in-lbf-s"]  # (4,)
     u: Annotated[Any, "in-lbf"]  # (4,) commanded rates of wheel momentum
+    torque: Annotated[Vec3, "in-lbf"]  # of the wheels on the body
     filter: Any  # `FilterLog`; None for `direct`
 
 
@@ -199,13 +204,13 @@ def sense(params: Params, scenario: Scenario, now, x: X, z: Z, noise) -> Reading
     angle = jnp.where(fresh, array(x.angle) + scenario.std_angle * noise[:3], last.angle.value)
     w = project(gyro_pyramid(scenario.alpha, scenario.beta), x.w) + scenario.bias
     gyro = read(channel(scenario.gyro, now.t, scenario.std_gyro, noise[GYRO], last.gyro.value), w)
-    tacho = x.h + scenario.std_tacho * noise[7:]
-    known = lambda fault: four((scenario.announced > 0) & active(fault, now.t))
+    tacho = read(channel(scenario.tacho, now.t, scenario.std_tacho, noise[7:], last.tacho.value), x.h)
+    told = lambda fault: four((scenario.announced > 0) & active(fault, now.t))
     return Readings(
         angle=Reading(angle, fresh),
-        gyro=Reading(gyro, ~known(scenario.gyro)),
-        tacho=Reading(tacho, jnp.ones(4, bool)),
-        up=jnp.where(known(scenario.wheel), 0.0, 1.0),
+        gyro=Reading(gyro, ~told(scenario.gyro) & heard(scenario.gyro, now.t)),
+        tacho=Reading(tacho, four(heard(scenario.tacho, now.t))),
+        up=jnp.where(told(scenario.wheel), 0.0, 1.0),
         integral=array(x.integral),
     )
 
@@ -215,10 +220,16 @@ def motors(scenario: Scenario, now) -> Channel:
     return four(channel(scenario.wheel, now.t, 0.0, 0.0, 0.0))
 
 
+def driven(scenario: Scenario, z: Z, h) -> tuple[Any, Vec3]:
+    """Rates of the wheels' momenta (4,) that the motors make of the command, and their torque on the body [in-lbf]."""
+    u = read(z.motors, wheel_rate(z.computer.u, h, scenario.torque_max, scenario.momentum_max))
+    return u, -resultant(z.wheels, u)
+
+
 def flow(params: Params, scenario: Scenario, t, x: X, z: Z) -> X:
     """dx/dt of the truth, the command held."""
-    u = read(z.motors, wheel_rate(z.computer.u, x.h, scenario.torque_max, scenario.momentum_max))
-    torque = scenario.disturbance - resultant(z.wheels, u)
+    u, by_wheels = driven(scenario, z, x.h)
+    torque = scenario.disturbance + by_wheels
     return X(
         integral=x.angle,
         angle=euler_rate(x.angle, x.w) - Vec3(0.0, 0.0, scenario.orbit_rate),  # eq. (4) inverted
@@ -298,11 +309,11 @@ def decide(params: Params, now, computer: Computer, y: Readings):
     suspicion = suspect(params, now, computer, prior, y)
     caught = worst_above(suspicion.gyro, params.threshold)
     dropped = computer.dropped | caught
-    known = y.gyro.valid & ~dropped
+    used = present(y.gyro) & ~dropped
 
-    gyro = jnp.where(known, y.gyro.value, jnp.stack(gyros_read(params, prior.mean)))
+    gyro = jnp.where(used, y.gyro.value, jnp.stack(gyros_read(params, prior.mean)))
     value = jnp.concatenate([y.angle.value, gyro, y.tacho.value])
-    valid = jnp.concatenate([y.angle.valid, known | (params.fill > 0), y.tacho.valid]) & (now.k > 0)
+    valid = jnp.concatenate([y.angle.valid, used | (params.fill > 0), y.tacho.valid]) & (now.k > 0)
     belief, met = update(prior, Reading(value, valid), partial(measured, params), params.R, ANGLES_MEASURED)
 
     state = [Vec3.of(belief.mean[part]) for part in (INTEGRAL, ANGLE, RATE)]
@@ -320,27 +331,31 @@ class Suspicion(NamedTuple):
 
 
 def suspect(params: Params, now, computer: Computer, prior: Belief, y: Readings) -> Suspicion:
-    """Chi-squares of the gyros' innovations, each for itself, and of their parity; honest if R = sigma^2."""
+    """Chi-squares of the gyros' innovations, each for itself, and of their parity; honest if R = sigma^2.
+
+    What is missing leaves its mean as it is.
+    """
     v = parity_vector(gyro_pyramid(params.alpha, params.beta))  # v' G = 0: free of the body rate
     joined = lambda weights, gyros: [*gyros, sum(weight * a for weight, a in zip(weights, gyros))]
     expected = lambda x: joined(v, gyros_read(params, x))
-    value, R = jnp.stack(joined(v, y.gyro.value)), jnp.stack(joined(v * v, params.R[GYRO]))
+    readable = present(y.gyro)
+    value, R = jnp.stack(joined(v, known(y.gyro, jnp.zeros(4)))), jnp.stack(joined(v * v, params.R[GYRO]))
     residual, variance = innovation(prior, value, expected, R)
-    readable = y.gyro.valid & jnp.isfinite(y.gyro.value)
     usable = jnp.append(readable & ~computer.dropped, jnp.all(readable)) & (now.k > 0)
-    mean = smoothed(computer.mean, jnp.where(usable, residual / jnp.sqrt(variance), 0), params.memory)
+    mean = jnp.where(usable, smoothed(computer.mean, residual / jnp.sqrt(variance), params.memory), computer.mean)
     statistic = chi_square(mean, params.memory)
     return Suspicion(mean, statistic[:4], statistic[4])
 
 
 def decide_direct(params: Params, now, computer: DirectComputer, y: Readings):
     """One tick of the computer without a filter: the rate by pseudo-inverse of the gyros in use. No log."""
+    angle = known(y.angle, computer.angle)
 
     def law():
         w = rate_from(computer.maps, y.gyro)
-        return command(params, now, y.up, Vec3.of(y.integral), Vec3.of(y.angle.value), w)
+        return command(params, now, y.up, Vec3.of(y.integral), Vec3.of(angle), w)
 
-    return computer._replace(u=every(CONTROL, now, law, computer.u)), ()
+    return computer._replace(u=every(CONTROL, now, law, computer.u), angle=angle), ()
 
 
 # the two closed loops
@@ -355,7 +370,7 @@ def init(params: Params, scenario: Scenario):
 def init_direct(params: Params, scenario: Scenario):
     """x, z at the start of the loop without a filter."""
     maps = rate_maps(gyro_pyramid(params.alpha, params.beta))
-    return init_truth(scenario, DirectComputer(jnp.zeros(4), maps))
+    return init_truth(scenario, DirectComputer(jnp.zeros(4), array(scenario.angle), maps))
 
 
 def tick(params: Params, scenario: Scenario, now, x: X, z: Z, noise):
@@ -367,20 +382,22 @@ def tick(params: Params, scenario: Scenario, now, x: X, z: Z, noise):
     tested = suspicion.gyro, suspicion.parity, computer.dropped
     error, squared = wrapped(truth - mean, ANGLES_ESTIMATED), nees(belief, truth, ANGLES_ESTIMATED)
     kept = FilterLog(mean, jnp.diagonal(cov), error, squared, met.nis, met.rows, met.nll, *tested)
-    return x, Z(readings, computer, motors(scenario, now), z.wheels), report(params, now, x, computer.u, kept)
+    z = Z(readings, computer, motors(scenario, now), z.wheels)
+    return x, z, report(params, scenario, now, x, z, kept)
 
 
 def tick_direct(params: Params, scenario: Scenario, now, x: X, z: Z, noise):
     """One tick of the loop without a filter."""
     readings = sense(params, scenario, now, x, z, noise)
     computer, _ = decide_direct(params, now, z.computer, readings)
-    return x, Z(readings, computer, motors(scenario, now), z.wheels), report(params, now, x, computer.u, None)
+    z = Z(readings, computer, motors(scenario, now), z.wheels)
+    return x, z, report(params, scenario, now, x, z, None)
 
 
-def report(params: Params, now, x: X, u, filter_log) -> Log:
-    """The log of one tick; u: (4,) commanded rates [in-lbf]; filter_log: `FilterLog` or None."""
-    error = angle_error(x.angle, target(params, now.t).angle)
-    return Log(now.t, x.integral, x.angle, error, x.w, x.h, u, filter_log)
+def report(params: Params, scenario: Scenario, now, x: X, z: Z, filter_log) -> Log:
+    """The log of one tick; z: after it; filter_log: `FilterLog` or None."""
+    error, torque = angle_error(x.angle, target(params, now.t).angle), driven(scenario, z, x.h)[1]
+    return Log(now.t, x.integral, x.angle, error, x.w, x.h, z.computer.u, torque, filter_log)
 
 
 BAND = 0.01 * DEG  # [rad] pointing band of the settling time

@@ -24,9 +24,9 @@ from jaxatt.check import finite, flag, inertia, limit, not_negative, positive, u
 from jaxatt.compiling import shared
 from jaxatt.contract import System
 from jaxatt.controllers import quaternion_pd, saturated
-from jaxatt.detection import alarm, isolate, window_sum
-from jaxatt.faults import Fault, Reading, any_active, first_onset, on_axes
-from jaxatt.sensors import read_triad, triad
+from jaxatt.detection import NONE, alarm, isolate, window_sum
+from jaxatt.faults import Fault, Reading, any_active, first_onset, known, on_axes, present
+from jaxatt.sensors import heard_triad, read_triad, triad
 from jaxatt.star_filters import LMMSE, Innovation, StarFilter, orbit_rate, star_angle
 from jaxatt.vec import Mat3, Quat, Vec3, cross, norm, where, zeros
 
@@ -43,6 +43,12 @@ def _turn(x, y, z) -> Quat:
     r = np.array([x, y, z]) * DEG
     angle = float(np.linalg.norm(r))
     return Quat(float(np.cos(angle / 2)), *(float(a) for a in np.sin(angle / 2) * r / angle))
+
+
+def _rate(q: Quat, x, y, z) -> Vec3:
+    """The body rate, in body axes, that differs from the orbital one by x, y, z [deg/s] at the attitude q."""
+    w = quat_to_body(q, Vec3(0.0, -1.1e-3, 0.0)) + DEG * Vec3(x, y, z)
+    return Vec3(*map(float, w))
 
 
 def on_sensor(number: int, faults: Vec3) -> Vec3:
@@ -64,7 +70,7 @@ class Params(NamedTuple):
     """What the engineer ships."""
 
     std_gyro: Annotated[Any, "rad/s", positive] = 3e-6  # believed noise of the gyro per sample
-    std_star: Annotated[Any, "1", positive] = 10 * ARCSEC  # believed noise of a star sensor per component
+    std_star: Annotated[Any, "1", positive] = 10 * ARCSEC  # believed noise of a star sensor per component and sample
     std_q0: Annotated[Any, "1", positive] = 1e-6  # standard deviation of the initial estimate, scalar part
     std_qv: Annotated[Any, "1", positive] = 1e-3  # the same, each component of the vector part
     std_bias: Annotated[Any, "rad/s", positive] = 10 * DEG / 3600  # prior of the gyro bias per axis; `WITH_BIAS` only
@@ -77,7 +83,7 @@ class Params(NamedTuple):
     feedback: Annotated[Any, "1", partial(check.one_of, allowed=(0, 1, 2))] = 0.0  # to the control; see `command`
     q_d: Annotated[Quat, "1", unit] = Quat(1.0, 0.0, 0.0, 0.0)  # target attitude in the orbit frame
     orbit_rate: Annotated[Any, "rad/s", finite] = 1.1e-3  # believed
-    J: Annotated[Mat3, "kg m^2", inertia] = INERTIA  # believed inertia
+    J: Annotated[Mat3, "kg m^2", inertia] = INERTIA  # believed inertia; products are the entries, J.x.y = -sum(m x y)
     bandwidth: Annotated[Any, "rad/s", positive] = 0.05  # of the PD control
     damping: Annotated[Any, "1", positive] = 0.9
     u_max: Annotated[Any, "N m", limit] = 0.2  # torque limit per axis
@@ -87,16 +93,18 @@ class Scenario(NamedTuple):
     """What the day brings."""
 
     q: Annotated[Quat, "1", unit] = _turn(0.10, -0.08, 0.12)  # initial attitude in the orbit frame, body to orbit
-    w: Annotated[Vec3, "rad/s", finite] = Vec3(2e-3 * DEG, -1e-3 * DEG - 1.1e-3, 1.5e-3 * DEG)  # initial, inertial
+    w: Annotated[Vec3, "rad/s", finite] = _rate(q, 2e-3, -1e-3, 1.5e-3)  # initial, of the inertial motion, body axes
     q_hat: Annotated[Quat, "1", partial(unit, tolerance=0.01), (2,)] = Quat(  # initial estimates; not of unit length
         np.ones(2), np.zeros(2), np.zeros(2), np.zeros(2)
     )
     stars: Annotated[Vec3, "1", unit, (2,)] = Params().stars  # true directions, orbit frame
     orbit_rate: Annotated[Any, "rad/s", finite] = 1.1e-3  # true
-    J: Annotated[Mat3, "kg m^2", inertia] = INERTIA  # true inertia
+    J: Annotated[Mat3, "kg m^2", inertia] = INERTIA  # true inertia, likewise
     torque: Annotated[Vec3, "N m", finite] = Vec3(2e-4, -1e-4, 1.5e-4)  # constant disturbance, body axes
-    std_gyro: Annotated[Any, "rad/s", not_negative] = 3e-6  # true noise of the gyro per sample: walk / sqrt(dt)
-    std_star: Annotated[Any, "1", not_negative] = 10 * ARCSEC  # true noise of a star sensor per component
+    std_gyro: Annotated[Any, "rad/s", not_negative] = (
+        3e-6  # true noise of the gyro per sample: angle random walk / sqrt(dt)
+    )
+    std_star: Annotated[Any, "1", not_negative] = 10 * ARCSEC  # true noise of a star sensor per component and sample
     bias: Annotated[Vec3, "rad/s", finite] = zeros()  # gyro bias at the start, eq. (4)
     walk: Annotated[Any, "rad/s/sqrt(s)", not_negative] = 0.0  # its random walk, eq. (4)
     star: Annotated[Vec3, "1", (2,)] = on_sensor(ROLL, tangential(ROLL, Fault(onset=100.0, bias=100 * ARCSEC)))
@@ -105,10 +113,10 @@ class Scenario(NamedTuple):
 
 
 class Readings(NamedTuple):
-    """What the sensors say at a tick; NaN where a gyro or a star sensor says nothing."""
+    """What the sensors say at a tick. A triad counts as a whole: it is not used where a component is NaN."""
 
-    gyro: Annotated[Vec3, "rad/s"]
-    stars: Annotated[Vec3, "1"]  # (2,) star directions in body axes
+    gyro: Annotated[Reading, "rad/s"]  # a `Vec3`, one flag
+    stars: Annotated[Reading, "1"]  # star directions in body axes, a `Vec3` of (2,), flags (2,)
     q: Annotated[Quat, "1"]  # ideal attitude, from a navigation of which the paper says nothing
     w: Annotated[Vec3, "rad/s"]  # ideal rate
 
@@ -125,8 +133,9 @@ class Computer(NamedTuple):
 
     filters: Any  # Moments or Belief, each leaf (2,): one filter for each star sensor
     gyro: Vec3  # [rad/s] last reading: the prediction from k-1 to k uses that of k-1
-    recent: Any  # (window, 2) [1] last values of r' M^-1 r
+    recent: Any  # (window, 2) [1] values of r' M^-1 r of the last stars
     latched: Any  # (2,) bool: alarms so far, for that of a constant fault ends by itself
+    cause: Any  # by latched alarms, when both filters last had a star
 
 
 class X(NamedTuple):
@@ -148,11 +157,11 @@ class Verdict(NamedTuple):
     """What the computer concludes at a tick."""
 
     innovation: Innovation  # each (2,): of both filters; no star is used at tick 0
-    J: Annotated[Any, "1"]  # (2,) evaluation, eq. (18)
-    alarm: Annotated[Any, "1"]  # (2,) bool
+    J: Annotated[Any, "1"]  # (2,) evaluation, eq. (18); that of the last star where there is none
+    alarm: Annotated[Any, "1"]  # (2,) bool; never without a star
     latched: Annotated[Any, "1"]  # (2,) bool: an alarm now or before
     cause: Annotated[Any, "1"]  # of detection: NONE, FIRST (roll star), SECOND (pitch star), COMMON (gyro), eq. (20)
-    latched_cause: Annotated[Any, "1"]  # the same from latched alarms
+    latched_cause: Annotated[Any, "1"]  # the same from latched alarms; both wait until both filters have a star
     angle: Annotated[Any, "1"]  # squared error of the angle between the measured stars, chi-square with one degree
     angle_alarm: Annotated[Any, "1"]  # bool: one of the stars and not the gyro
 
@@ -170,6 +179,7 @@ class Log(NamedTuple):
     nees: Annotated[Any, "1"]  # each: error squared in units of its covariance, vector part: 3 degrees of freedom
     nees_q: Annotated[Any, "1"]  # each: the same of all four components (three where the filter has no more)
     bias: Annotated[Vec3, "rad/s"]  # each: estimated gyro bias, on board; zero where the filter has none
+    estimate: Annotated[Quat, "1"]  # each: attitude, on board
     readings: Readings  # what the computer was told
 
 
@@ -200,18 +210,21 @@ HEALTHY = on_sensor(ROLL, on_axes(Fault()))  # no fault of either star sensor
 def init(star_filter: StarFilter, window: int, params: Params, scenario: Scenario):
     """x, z at the start; window: how many values the evaluation sums."""
     filters = jax.vmap(partial(star_filter.start, params))(scenario.q_hat)
-    readings = Readings(scenario.w, scenario.stars, scenario.q, scenario.w)
-    computer = Computer(filters, scenario.w, jnp.zeros((window, 2)), jnp.zeros(2, bool))
+    stars = Reading(scenario.stars, jnp.ones(2, bool))
+    readings = Readings(Reading(scenario.w, True), stars, scenario.q, scenario.w)
+    computer = Computer(filters, scenario.w, jnp.zeros((window, 2)), jnp.zeros(2, bool), jnp.asarray(NONE))
     return X(scenario.q, scenario.w), Z(SensorState(readings, scenario.bias), computer, zeros())
 
 
 def sense(params: Params, scenario: Scenario, now, x: X, z: Z, noise) -> SensorState:
     """What the sensors read; noise: 12 normals, gyro, walk of its bias, stars by axis and then by sensor."""
     last = z.sensors.readings
-    gyro = read_triad(triad(scenario.gyro, now.t, scenario.std_gyro, noise[:3], last.gyro), x.w + z.sensors.bias)
+    gyro = triad(scenario.gyro, now.t, scenario.std_gyro, noise[:3], last.gyro.value)
+    gyro = Reading(read_triad(gyro, x.w + z.sensors.bias), heard_triad(scenario.gyro, now.t))
     axes = Vec3(noise[6:8], noise[8:10], noise[10:12])
-    stars = triad(scenario.star, now.t, scenario.std_star, axes, last.stars)  # eq. (10)
+    stars = triad(scenario.star, now.t, scenario.std_star, axes, last.stars.value)  # eq. (10)
     stars = read_triad(stars, quat_to_body(x.q, scenario.stars))  # eq. (6)
+    stars = Reading(stars, heard_triad(scenario.star, now.t))
     bias = z.sensors.bias + scenario.walk * now.dt**0.5 * Vec3(*noise[3:6])  # eq. (4)
     return SensorState(Readings(gyro, stars, x.q, x.w), bias)
 
@@ -234,22 +247,28 @@ def computer_of(x: X, z: Z) -> Computer:
 def decide(params: Params, now, computer: Computer, readings: Readings, star_filter: StarFilter = LMMSE):
     """One tick on board: both filters, alarms, their cause. Returns computer and `Verdict`.
 
-    A star that is NaN is not used; for a gyro that is NaN the last reading stands.
+    A star that is missing is not used: its filter predicts, its window stands still. For a missing gyro the last reading
+    stands. Both verdicts wait until both filters have a star, for one alone cannot tell its sensor from the gyro.
     """
-    lengths = norm(readings.stars)
-    pointing = readings.stars / jnp.where(lengths > 0, lengths, 1)
-    y = Reading(where(params.unit > 0, pointing, readings.stars), jnp.broadcast_to(now.k > 0, (2,)))
+    there = present(readings.stars)
+    stars = known(readings.stars, params.stars)
+    lengths = norm(stars)
+    pointing = stars / jnp.where(lengths > 0, lengths, 1)
+    used = there & (now.k > 0)
+    y = Reading(where(params.unit > 0, pointing, stars), used)
     elapsed = jnp.where(now.k > 0, now.dt, 0.0)  # the filters start with what is believed at tick 0
     filters, innovation = advanced(star_filter, params, computer.filters, computer.gyro, y, elapsed)
 
-    recent, J = window_sum(computer.recent, innovation.nis)  # eq. (18)
-    alarms = alarm(J, params.threshold)
+    recent = jnp.where(used, window_sum(computer.recent, innovation.nis)[0], computer.recent)
+    J = recent.sum(axis=0)  # eq. (18)
+    alarms = used & alarm(J, params.threshold)
     latched = computer.latched | alarms
-    angle = star_angle(*_pair(pointing), *_pair(params.stars), std=params.std_star)
-    causes = isolate(*alarms), isolate(*latched)  # eq. (20)
-    verdict = Verdict(innovation, J, alarms, latched, *causes, angle, alarm(angle, params.angle_threshold))
-    gyro = where(scores.finite(readings.gyro), readings.gyro, computer.gyro)
-    return Computer(filters, gyro, recent, latched), verdict
+    angle = jnp.where(there.all(), star_angle(*_pair(pointing), *_pair(params.stars), std=params.std_star), 0)
+    cause = jnp.where(used.all(), isolate(*alarms), NONE)  # eq. (20)
+    latched_cause = jnp.where(used.all(), isolate(*latched), computer.cause)
+    angle_alarm = alarm(angle, params.angle_threshold)
+    verdict = Verdict(innovation, J, alarms, latched, cause, latched_cause, angle, angle_alarm)
+    return Computer(filters, known(readings.gyro, computer.gyro), recent, latched, latched_cause), verdict
 
 
 def _pair(v: Vec3):
@@ -280,8 +299,9 @@ def tick(star_filter: StarFilter, params: Params, scenario: Scenario, now, x: X,
     u = command(star_filter, params, computer, sensors.readings)
     torque = read_triad(triad(scenario.actuator, now.t, 0.0, zeros(), z.torque), u)
     errors = jax.lax.map(lambda belief: star_filter.error(belief, x.q), computer.filters)
-    bias = star_filter.bias(computer.filters.mean)
-    log = Log(now.t, x.q, x.w, torque, verdict, *errors, bias=bias, readings=sensors.readings)
+    mean = computer.filters.mean
+    on_board = dict(bias=star_filter.bias(mean), estimate=star_filter.attitude(mean), readings=sensors.readings)
+    log = Log(now.t, x.q, x.w, torque, verdict, *errors, **on_board)
     return x, Z(sensors, computer, torque), log
 
 

@@ -25,7 +25,7 @@ from jaxatt.compiling import shared
 from jaxatt.contract import System
 from jaxatt.controllers import Adaptation, Mrac, mrac_flow, mrac_flow_bound, mrac_input, mrac_sampled_bound, mrac_step
 from jaxatt.delays import delayed, pushed
-from jaxatt.faults import Channel, Fault, any_active, channel, first_onset, read
+from jaxatt.faults import Channel, Fault, Reading, any_active, channel, first_onset, heard, known, present, read
 from jaxatt.observers import LeastSquares, least_squares
 from jaxatt.sensors import quantised
 from jaxatt.wheels import Wheel, wheel_acceleration
@@ -72,10 +72,12 @@ class Scenario(NamedTuple):
     J_w: Annotated[Any, "kg m^2", positive] = J_WHEEL  # true wheel inertia
     J_z: Annotated[Any, "kg m^2", positive] = 5.421  # true platform inertia
     wheel: Wheel = Wheel()  # speeds in deg/s
-    noise: Annotated[Any, "deg", finite, not_negative] = 0.05  # of the attitude: half-width if uniform, else std
+    noise: Annotated[Any, "deg", finite, not_negative] = 0.05  # of the attitude per sample: half-width, std if Gaussian
     uniform: Annotated[Any, "1", flag] = 1.0  # 1: the attitude noise is uniform; 0: Gaussian
     delay: Annotated[Any, "s", not_negative] = 0.0  # age of the attitude readings, at most `DELAYS` ticks
-    tacho_noise: Annotated[Any, "deg/s", finite, not_negative] = 0.0  # standard deviation of the wheel-speed noise
+    tacho_noise: Annotated[Any, "deg/s", finite, not_negative] = (
+        0.0  # std of the wheel-speed noise per sample, one a tick
+    )
     tacho_step: Annotated[Any, "deg/s", finite, not_negative] = 0.0  # quantisation of the wheel speed; 0 for none
     momentum: Annotated[Any, "kg m^2 deg/s", finite] = 0.0  # total at the start, which eq. (1) takes as zero
     torque: Annotated[Any, "N m", finite] = 0.0  # disturbance
@@ -88,8 +90,8 @@ class Scenario(NamedTuple):
 class Readings(NamedTuple):
     """What the sensors say at a tick."""
 
-    theta: Any  # [deg] attitude
-    y: Any  # [deg/s] wheel speed
+    theta: Reading  # [deg] attitude
+    y: Reading  # [deg/s] wheel speed
 
 
 class Memory(NamedTuple):
@@ -98,8 +100,9 @@ class Memory(NamedTuple):
     estimate: LeastSquares  # of a = -J_w / J_z
     r: Any  # [deg/s] desired wheel speed
     u: Any  # [deg/s] command; the continuous law goes on changing it until the next tick
-    theta: Any  # [deg] last attitude reading
-    turns: Any  # [deg] W at that reading
+    theta: Any  # [deg] last attitude reading, or what the wheel's turns since make of it
+    fresh: Any  # bool, theta was read
+    turns: Any  # [deg] W then
     predicted: Any  # [deg] attitude that the estimate predicts
 
 
@@ -114,7 +117,7 @@ class Computer(NamedTuple):
 class SensorState(NamedTuple):
     """What the sensors hold until the next tick."""
 
-    line: Any  # (DELAYS + 1,) [deg] the latest attitude readings, newest first
+    line: Reading  # (DELAYS + 1,) [deg] the latest attitude readings, newest first
     tacho: Channel  # the wheel speed is read continuously
     readings: Readings
 
@@ -147,7 +150,7 @@ class Log(NamedTuple):
     target: Annotated[Any, "deg"]  # desired attitude
     target_rate: Annotated[Any, "deg/s"]
     error: Annotated[Any, "deg"]  # desired minus true attitude
-    measured: Annotated[Any, "deg"]  # desired minus read attitude, on board
+    measured: Annotated[Any, "deg"]  # desired minus read attitude, on board; minus the expected one where none is read
     y: Annotated[Any, "deg/s"]  # wheel speed
     y_m: Annotated[Any, "deg/s"]  # reference model, on board
     r: Annotated[Any, "deg/s"]  # desired wheel speed, on board
@@ -158,7 +161,7 @@ class Log(NamedTuple):
     a_y: Annotated[Any, "1"]  # on board
     J_hat: Annotated[Any, "kg m^2"]  # on board
     P: Annotated[Any, "1/(deg^2 s)"]  # gain of the estimator, on board
-    residual: Annotated[Any, "deg/s"]  # read wheel speed minus reference model, on board
+    residual: Annotated[Any, "deg/s"]  # read wheel speed minus reference model, on board; 0 where none is read
     alarm: Annotated[Any, "1"]  # bool, on board
     flipped: Annotated[Any, "1"]  # bool, the estimate was set to J_most, on board
     failed: Annotated[Any, "1"]  # bool, the run has diverged
@@ -208,19 +211,22 @@ def fastest(params: Params):
 def init(params: Params, scenario: Scenario):
     """x, z at the start: everything at rest at zero."""
     mrac = Mrac(0.0, params.a_r, params.a_y)
-    memory = Memory(LeastSquares(-params.J_w / params.J_hat, params.P0), 0.0, 0.0, 0.0, 0.0, 0.0)
-    sensors = SensorState(jnp.zeros(DELAYS + 1), Channel(0.0, 0.0), Readings(0.0, 0.0))
+    memory = Memory(LeastSquares(-params.J_w / params.J_hat, params.P0), 0.0, 0.0, 0.0, True, 0.0, 0.0)
+    line, nothing = Reading(jnp.zeros(DELAYS + 1), jnp.ones(DELAYS + 1, bool)), Reading(0.0, True)
+    sensors = SensorState(line, Channel(0.0, 0.0), Readings(nothing, nothing))
     return X(0.0, 0.0, mrac, 0.0), Z(sensors, memory, Channel(0.0, 0.0), 0.0, False)
 
 
 def sense(params: Params, scenario: Scenario, now, x: X, z: Z, noise) -> SensorState:
     """What the sensors read now and hold until the next tick; noise: 3 normals (attitude, wheel speed, drive)."""
     shape = jnp.where(scenario.uniform > 0, jax.lax.erf(noise[0] / sqrt(2)), noise[0])
-    attitude = channel(scenario.attitude, now.t, scenario.noise, shape, z.sensors.line[0])
-    line = pushed(z.sensors.line, read(attitude, x.theta))
-    tacho = channel(scenario.tacho, now.t, scenario.tacho_noise, noise[1], z.sensors.readings.y)
-    readings = Readings(delayed(line, scenario.delay / now.dt), tachometer(scenario, tacho, x.y))
-    return SensorState(line, tacho, readings)
+    attitude = channel(scenario.attitude, now.t, scenario.noise, shape, z.sensors.line.value[0])
+    newest = Reading(read(attitude, x.theta), heard(scenario.attitude, now.t))
+    line, age = Reading(*map(pushed, z.sensors.line, newest)), scenario.delay / now.dt
+    theta = Reading(delayed(line.value, age), delayed(jnp.where(line.valid, 0.0, 1.0), age) == 0)
+    tacho = channel(scenario.tacho, now.t, scenario.tacho_noise, noise[1], z.sensors.readings.y.value)
+    y = Reading(tachometer(scenario, tacho, x.y), heard(scenario.tacho, now.t))
+    return SensorState(line, tacho, Readings(theta, y))
 
 
 def tachometer(scenario: Scenario, tacho: Channel, y):
@@ -237,32 +243,41 @@ def computer_of(x: X, z: Z) -> Computer:
 
 
 def decide(params: Params, now, computer: Computer, readings: Readings):
-    """One tick on board (choice 4): estimate, then desired speed. Returns computer and (residual, alarm, flipped)."""
+    """One tick on board (choice 4): estimate, then desired speed. Returns computer and (residual, alarm, flipped).
+
+    Of what is missing (choice 9) the computer takes what it expects: the attitude from the wheel's turns, the wheel speed
+    from the reference model.
+    """
     mrac, turns, last = computer
     estimate, flipped = estimated(params, now, computer, readings)
     target, target_rate = slew(params, now.t)
-    increment = last.predicted + estimate.a * (turns - last.turns)
-    predicted = jnp.where(params.differenced > 0, increment, estimate.a * turns)
-    blended = predicted + params.blend * (readings.theta - predicted)
-    feedback = jnp.where(params.ope > 0, blended, readings.theta)
+    moved = estimate.a * (turns - last.turns)
+    predicted = jnp.where(params.differenced > 0, last.predicted + moved, estimate.a * turns)
+    fresh, theta = present(readings.theta), known(readings.theta, last.theta + moved)
+    blended = predicted + jnp.where(fresh, params.blend * (theta - predicted), 0)
+    feedback = jnp.where(params.ope > 0, blended, theta)
     r = (params.forward * target_rate + params.K * (target - feedback)) / estimate.a  # choice 2
-    residual = readings.y - mrac.y_m
+    y = known(readings.y, mrac.y_m)
+    residual = y - mrac.y_m
     alarm = ~(jnp.abs(residual) <= params.residual_max)  # so that NaN alarms
-    memory = Memory(estimate, r, mrac_input(mrac, r, readings.y), readings.theta, turns, predicted)
+    memory = Memory(estimate, r, mrac_input(mrac, r, y), theta, fresh, turns, predicted)
     return computer._replace(memory=memory), (residual, alarm, flipped)
 
 
 def decide_sampled(params: Params, now, computer: Computer, readings: Readings):
     """`decide`, then the adaptation law by one step of forward Euler."""
     computer, out = decide(params, now, computer, readings)
-    return computer._replace(mrac=mrac_step(computer.mrac, params.law, computer.memory.r, readings.y, now.dt)), out
+    y = known(readings.y, computer.mrac.y_m)
+    return computer._replace(mrac=mrac_step(computer.mrac, params.law, computer.memory.r, y, now.dt)), out
 
 
 def estimated(params: Params, now, computer: Computer, readings: Readings):
     """The estimate of a after eqs. (7)-(10), and whether it had to be kept from changing its sign."""
     turns, last, rates = computer.turns, computer.memory, params.differenced > 0
-    W = jnp.where(rates, (turns - last.turns) / now.dt, turns)
-    output = jnp.where(rates, (readings.theta - last.theta) / now.dt, readings.theta)
+    theta = known(readings.theta, 0.0)
+    used = present(readings.theta) & (last.fresh | ~rates)  # without a reading the estimator forgets and learns nothing
+    W = jnp.where(used, jnp.where(rates, (turns - last.turns) / now.dt, turns), 0)
+    output = jnp.where(used, jnp.where(rates, (theta - last.theta) / now.dt, theta), 0)
     due = (params.ope > 0) & (now.k > 0)
     new = least_squares(last.estimate, W, output, now.dt, params.forget)
     least = -params.J_w / params.J_most
@@ -273,14 +288,15 @@ def estimated(params: Params, now, computer: Computer, readings: Readings):
 
 def computer_flow(params: Params, computer: Computer, readings: Readings) -> dict[str, Any]:
     """Rates of what moves on board between ticks with continuous adaptation: r is held, u is not."""
-    mrac = mrac_flow(computer.mrac, params.law, computer.memory.r, readings.y, params.a_m, params.b_m)
-    return dict(mrac=mrac, turns=readings.y)
+    y = known(readings.y, computer.mrac.y_m)
+    mrac = mrac_flow(computer.mrac, params.law, computer.memory.r, y, params.a_m, params.b_m)
+    return dict(mrac=mrac, turns=y)
 
 
 def computer_flow_sampled(params: Params, computer: Computer, readings: Readings) -> dict[str, Any]:
     """The same with sampled adaptation: r and u are held."""
     y_m = params.b_m * computer.memory.r - params.a_m * computer.mrac.y_m  # eq. (2)
-    return dict(mrac=Mrac(y_m, 0.0, 0.0), turns=readings.y)
+    return dict(mrac=Mrac(y_m, 0.0, 0.0), turns=known(readings.y, computer.mrac.y_m))
 
 
 # the loop
@@ -302,7 +318,7 @@ def tick(sampled: bool, params: Params, scenario: Scenario, now, x: X, z: Z, noi
         target=target,
         target_rate=target_rate,
         error=target - x.theta,
-        measured=target - sensors.readings.theta,
+        measured=target - memory.theta,
         y=x.y,
         y_m=x.mrac.y_m,
         r=memory.r,
@@ -331,9 +347,10 @@ def flow(sampled: bool, params: Params, scenario: Scenario, t, x: X, z: Z) -> X:
     sane = ~z.failed & (jnp.abs(x.y) < RUNAWAY)
     x = x._replace(y=jnp.where(sane, x.y, 0))
     computer = computer_of(x, z)
-    readings = z.sensors.readings._replace(y=tachometer(scenario, z.sensors.tacho, x.y))
+    y = Reading(tachometer(scenario, z.sensors.tacho, x.y), z.sensors.readings.y.valid)
+    readings = z.sensors.readings._replace(y=y)
     on_board = (computer_flow_sampled if sampled else computer_flow)(params, computer, readings)
-    u = z.memory.u if sampled else mrac_input(x.mrac, z.memory.r, readings.y)
+    u = z.memory.u if sampled else mrac_input(x.mrac, z.memory.r, known(y, x.mrac.y_m))
     u = read(z.drive, jnp.clip(u, -scenario.wheel.u_max, scenario.wheel.u_max))  # lost after the bound, not before
     wheel = scenario.wheel._replace(friction=z.friction, u_max=jnp.inf)
     rate = X(body_rate(scenario, t, x.y), wheel_acceleration(wheel, x.y, u), **on_board)  # eqs. (1), (3)
