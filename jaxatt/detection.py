@@ -122,6 +122,6 @@ def chi_square(mean, memory):
 
 
 def worst_above(statistic, threshold):
-    """Which of n channels, at most one, has the largest statistic and that above the threshold: bool, shape (n,)."""
+    """Which of n channels, at most one, has the largest statistic and that above the threshold: bool (n,); NaN is above."""
     worst = jax.nn.one_hot(jnp.argmax(statistic, axis=0), len(statistic), dtype=bool, axis=0)
-    return worst & (jnp.max(statistic, axis=0) > threshold)
+    return worst & alarm(jnp.max(statistic, axis=0), threshold)

@@ -217,7 +217,7 @@ def _update(h: Callable, belief: Belief, reading: Reading, R, period, triangle=T
         def less(j, gr):
             return gr[0] - E[j, i] * D[j], gr[1] - E[j, i] * e[j]
 
-        g, r = jax.lax.fori_loop(0, i if triangle else k, less, (HP[i], value[i]))
+        g, r = jax.lax.fori_loop(0, i if triangle else k, less, (jnp.where(impossible, 0, HP[i]), value[i]))
         Hg = H(g)
         s = Hg[i] + noise[i]
         whole = s + jnp.sum(E[:, i] ** 2, axis=0)  # S[i, i]

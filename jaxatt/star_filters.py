@@ -11,7 +11,9 @@ May import: check, compiling, vec, attitude, faults, scores.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import reduce
 from math import log, pi
+from operator import and_
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -113,7 +115,7 @@ def update_three(belief, y: Reading, h: Callable, expected: Vec3, variance):
     belief: prediction, n components and n rows; y: the measurement, a `Vec3`, and whether it is valid; h: linear map of a
     state to the measurement; expected: the measurement expected of the mean; variance of each component's noise, equal and
     independent. What is not valid or not finite moves neither mean nor covariance, nor does anything where M, the covariance
-    of the residual, is not positive definite.
+    of the residual, is not positive definite, or a variance, of the noise or on the diagonal of P, is negative or NaN.
     """
 
     there = y.valid & scores.finite(y.value)
@@ -123,7 +125,8 @@ def update_three(belief, y: Reading, h: Callable, expected: Vec3, variance):
         CPC = [h(column) for column in zip(*PH)]
         M = Mat3(*(Vec3(*row) for row in symmetric(3, lambda i, j: CPC[i][j] + (variance if i == j else 0))))
         size = det(M)
-        definite = (M.x.x > 0) & (M.x.x * M.y.y > M.x.y * M.x.y) & (size > 0)
+        definite = _definite(M) & (variance >= 0)
+        definite = reduce(and_, (P[i][i] >= 0 for i in range(len(P))), definite)
         M_inv, used = inverse(M), there & definite
         K = tuple(where(used, M_inv @ row, zeros()) for row in PH)  # P C' M^-1
         return PH, M, M_inv, size, definite, K
@@ -132,10 +135,15 @@ def update_three(belief, y: Reading, h: Callable, expected: Vec3, variance):
     PH, M, M_inv, size, definite, K = shared(gain, P, there)
     r = where(there, y.value - expected, zeros())
     x = type(x)(*(a + k @ r for a, k in zip(x, K)))
-    P = symmetric(len(P), lambda i, j: P[i][j] - K[i] @ PH[j])  # P - K M K'
+    P = symmetric(len(P), lambda i, j: _less(P[i][j], K[i] @ PH[j], i == j))  # P - K M K'
     nis = jnp.where(definite, r @ (M_inv @ r), jnp.nan)
     nll = jnp.where(there, 0.5 * (nis + jnp.log(size) + 3 * log(2 * pi)), 0)
     return x, P, Innovation(r, M, nis, jnp.where(there, 3.0, 0.0), nll)
+
+
+def _less(p, q, is_variance: bool):
+    """p - q; rounding makes no variance negative."""
+    return jnp.maximum(p - q, jnp.minimum(p, 0)) if is_variance else p - q
 
 
 # the filters
@@ -274,18 +282,25 @@ def mekf_update(belief: Belief, y: Reading, s: Vec3, std) -> tuple[Belief, Innov
 # how wrong an estimate is
 
 
+def _definite(M: Mat3):
+    """Whether a symmetric matrix is positive definite, by its leading minors."""
+    return (M.x.x > 0) & (M.x.x * M.y.y > M.x.y * M.x.y) & (det(M) > 0)
+
+
 def quaternion_error(x: Quat, P, q: Quat):
     """How far the estimate x of the quaternion q is off: turn [rad], its deviation [rad], NEES of three and of four.
 
     P: covariance of x, 4 rows of 4 [1]. The turn is taken to first order. NEES: error squared in units of its covariance, of
-    the vector part and of all four components.
+    the vector part and of all four components; NaN: P is no covariance.
     """
     e = x - q * jnp.where(x @ q < 0, -1, 1)  # q and -q are one attitude
     b = Vec3(*P[0][1:4])
-    D_inv = inverse(Mat3(*(Vec3(*row[1:4]) for row in P[1:4])))
-    nees = e.v @ (D_inv @ e.v)
+    D = Mat3(*(Vec3(*row[1:4]) for row in P[1:4]))
+    D_inv = inverse(D)
+    nees = jnp.where(_definite(D), e.v @ (D_inv @ e.v), jnp.nan)
     rest = e.w - b @ (D_inv @ e.v)  # block elimination of the vector part leaves the scalar part's own share
-    nees_q = nees + rest * rest / (P[0][0] - b @ (D_inv @ b))
+    own = P[0][0] - b @ (D_inv @ b)
+    nees_q = nees + jnp.where(own > 0, rest * rest / own, jnp.nan)
     std = Vec3(*(2 * jnp.sqrt(P[i][i]) for i in (1, 2, 3)))
     return 2 * e.v, std, nees, nees_q
 
@@ -294,7 +309,8 @@ def mekf_error(x: Quat, P, q: Quat):
     """The same of a multiplicative EKF, P its covariance of the turn [rad^2], 3 rows; its two NEES are one number."""
     error = quat_error(x, q)
     turn = error.v * jnp.where(error.w < 0, -2, 2)
-    nees = turn @ (inverse(Mat3(*(Vec3(*row) for row in P))) @ turn)
+    D = Mat3(*(Vec3(*row) for row in P))
+    nees = jnp.where(_definite(D), turn @ (inverse(D) @ turn), jnp.nan)
     return turn, Vec3(*(jnp.sqrt(P[i][i]) for i in range(3))), nees, nees
 
 
@@ -377,5 +393,6 @@ def star_angle(a: Vec3, b: Vec3, s: Vec3, p: Vec3, std):
     gyro. 0 where a star is missing (NaN).
     """
     error = a @ b - s @ p
+    error = jnp.where(jnp.isnan(error), 0, error)
     variance = 2 * std**2 * (1 - (s @ p) ** 2)
-    return jnp.where(jnp.isnan(error), 0, error * error / variance)
+    return error * error / variance

@@ -100,3 +100,7 @@ def test_smoothed_noise_is_chi_square():
     m = jax.lax.scan(lambda m, z: ((n := detection.smoothed(m, z, 0.25)), n), 0.0, jnp.asarray(z))[1]
     c = np.asarray(detection.chi_square(m, 0.25))[100:]
     np.testing.assert_allclose([c.mean(), (c > 3.841).mean()], [1, 0.05], rtol=0.05)
+
+
+def test_a_statistic_that_is_no_number_is_above_any_threshold():
+    np.testing.assert_array_equal(detection.worst_above(jnp.array([1.0, np.nan, 9.0]), 5.0), [False, True, False])

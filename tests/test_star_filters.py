@@ -111,3 +111,39 @@ def test_the_angle_between_two_stars_is_judged_by_its_own_variance():
     np.testing.assert_allclose(got, (a @ b - s @ p) ** 2 / (2e-4 * (1 - (s @ p) ** 2)), rtol=1e-9)
     assert star_angle(Vec3(*s), Vec3(*p), Vec3(*s), Vec3(*p), 0.01) == 0
     assert star_angle(Vec3(np.nan, 0.0, 0.0), Vec3(*p), Vec3(*s), Vec3(*p), 0.01) == 0
+
+
+# no covariance
+
+
+@pytest.mark.parametrize("P0, R", [(-1.0, 0.5), (1.0, -2.0), (1.0, -0.5), (-0.1, 1.0), (1.0, np.nan), (np.nan, 1.0)])
+def test_an_impossible_variance_is_no_perfect_fit_and_moves_nothing(P0, R):
+    P = star_filters.diagonal(1.0, P0, 1.0)
+    belief, y = star_filters.Belief(Vec3(0.0, 0.0, 0.0), P), Reading(Vec3(3.0, 3.0, 3.0), True)
+    mean, cov, told = star_filters.update_three(belief, y, lambda a: Vec3(*a), Vec3(0.0, 0.0, 0.0), R)
+    assert np.isnan(told.nis) and np.isnan(told.nll)
+    np.testing.assert_array_equal(mean, 0)
+    np.testing.assert_array_equal([cov[i][i] for i in range(3)], [1.0, P0, 1.0])
+
+
+def test_the_error_of_an_impossible_covariance_is_no_number():
+    one, q = Quat(1.0, 0.0, 0.0, 0.0), Quat(1.0, 1e-3, 0.0, 0.0)
+    good = star_filters.diagonal(1e-6, 1e-6, 1e-6, 1e-6)
+    assert all(np.isfinite(a) for a in star_filters.quaternion_error(one, good, q)[2:])
+    for i in range(4):
+        P = star_filters.diagonal(*(-1e-6 if j == i else 1e-6 for j in range(4)))
+        nees, nees_q = star_filters.quaternion_error(one, P, q)[2:]
+        assert np.isnan(nees_q) and (i == 0 or np.isnan(nees))
+        if i < 3:
+            assert np.isnan(star_filters.mekf_error(one, [row[:3] for row in P[:3]], q)[2:]).all()
+
+
+def test_rounding_makes_no_variance_negative():
+    """A measurement far better than the prior, in float32: 1 - 1 / (1 + 1e-12) rounds to or below zero."""
+    P = star_filters.diagonal(*np.float32([1.0, 3.0, 7.0]))
+    belief, y = star_filters.Belief(Vec3(*np.float32([0, 0, 0])), P), Reading(Vec3(*np.float32([1, 1, 1])), True)
+    h = lambda a: Vec3(a[0] + a[1], a[1] + a[2], a[2] + a[0])
+    for _ in range(3):
+        mean, P, told = star_filters.update_three(belief, y, h, h(belief.mean), np.float32(1e-6))
+        belief = star_filters.Belief(mean, P)
+        assert all(P[i][i] >= 0 for i in range(3)) and not np.isnan(told.nis)
