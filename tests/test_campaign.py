@@ -1,11 +1,13 @@
 import errno
 import json
 import os
+import runpy
 import subprocess
 import sys
 import time
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from importlib import import_module
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -20,7 +22,7 @@ from benchmarks import tiny_campaign as tiny
 from jaxatt import simulate, sweep
 from jaxatt.campaign import dataset, extend, rerun, run, scenarios, until, workers
 from jaxatt.campaign.draw import checked, results
-from jaxatt.campaign.provenance import environment
+from jaxatt.campaign.provenance import environment, manifest_of
 from jaxatt.campaign.store import lock_file
 from jaxatt.campaign.summary import failing
 
@@ -358,8 +360,17 @@ def test_another_campaign_is_refused_by_name(whole, tmp_path, monkeypatch):
     def sample(key, index):  # another code under the same name
         return tiny.Scenario(**tiny.draw(key, index + 1))
 
-    monkeypatch.setattr(sample, "__module__", tiny.sample.__module__)
-    monkeypatch.setattr(sample, "__qualname__", "sample")
+    sample.__qualname__ = "sample"
+    with pytest.raises(
+        ValueError, match=r"these differ: sample is 'sample \(code of Python 3\.\d+, crc32 \w{8}\)', but"
+    ):
+        run(path, tiny.campaign(sample=sample), N)
+
+    class Sample:  # says that it is the other one
+        __wrapped__ = tiny.sample
+        __call__ = staticmethod(sample)
+
+    sample = Sample()
     with pytest.raises(ValueError, match=r"must give the numbers of x\.zarr, but for the scenarios 0 to 127 these"):
         run(path, tiny.campaign(sample=sample), N)
     assert tiny.files(path) == before
@@ -442,3 +453,54 @@ def test_float32_stays_float32(tmp_path):
     one = jax.tree.map(lambda a: a[129], scenarios(c, 0, 130))
     log = simulate(tiny.system, small, one, KEY, ticks=1)
     assert log.x.dtype == np.float32
+
+
+SCRIPT = """
+import jax
+from benchmarks import tiny_campaign as tiny
+
+LEVEL = 1.0
+
+def level(index):
+    return LEVEL * tiny.draw(KEY, index)["start"]
+
+KEY = jax.random.key(9)
+
+def make(factor):
+    @jax.jit
+    def sample(key, index):
+        return tiny.Scenario(**{**tiny.draw(key, index), "start": factor * level(index)})
+    return sample
+
+study = tiny.campaign(sample=make(1.0), inputs=lambda key, index: {"start": level(index)})
+"""
+
+
+def test_functions_of_a_script_are_what_they_are_whatever_it_is_called(tmp_path, monkeypatch):
+    """Run as a script, renamed and run, imported: one campaign; with another number, captured or global: another."""
+    monkeypatch.syspath_prepend(tmp_path)
+    changed = SCRIPT.replace("LEVEL = 1.0", "LEVEL = 1.5"), SCRIPT.replace("make(1.0)", "make(2.0)")
+    edited = SCRIPT.replace("* level", "* 1.0 * level")
+    texts = dict(
+        first_study=SCRIPT, second_study=f"# moved down\n\n{SCRIPT}", third=changed[0], fourth=changed[1], fifth=edited
+    )
+    for name, text in texts.items():
+        (tmp_path / f"{name}.py").write_text(text)
+    script = lambda name: runpy.run_path(str(tmp_path / f"{name}.py"), run_name="__main__")["study"]
+    told = lambda campaign: {k: v for k, v in manifest_of(checked(campaign), N).items() if k != "history"}
+    first = told(script("first_study"))
+    assert first == told(script("second_study")) == told(import_module("second_study").study)
+    for name, differ in (("third", {"sample", "inputs"}), ("fourth", {"sample"}), ("fifth", {"sample"})):
+        other = told(import_module(name).study)
+        assert {k for k in first if first[k] != other[k]} == differ
+    assert first["system.check"] == told(tiny.campaign())["system.check"]
+
+
+def test_a_script_is_resumed_and_rerun_by_its_import(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "resumed_study.py").write_text(SCRIPT)
+    study = runpy.run_path(str(tmp_path / "resumed_study.py"), run_name="__main__")["study"]
+    run(tmp_path / "x.zarr", study, 128)
+    again = import_module("resumed_study").study
+    data = extend(tmp_path / "x.zarr", again, 256)
+    assert data.sizes["scenario"] == 256 and len(rerun(tmp_path / "x.zarr", again, 130).t) == study.ticks

@@ -1,20 +1,27 @@
 """What a store says of where its numbers come from: the inputs of the campaign by name, and the machine.
 
-A campaign goes on only where all of it is the same; the message says what differs.
+A campaign goes on only where all of it is the same; the message says what differs. Functions of installed packages are
+compared by their names, those of a user by what they are: their code, what they capture, and the functions and numbers
+that they use. So a script may be renamed, or run and then imported.
 
 May import: check, store, draw.
 """
 
 from __future__ import annotations
 
+import dis
 import os
 import platform
+import re
 import subprocess
+import sys
+import sysconfig
 import zlib
 from collections.abc import Collection, Mapping
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
+from types import CodeType, FunctionType, ModuleType
 
 import jax
 import numpy as np
@@ -89,18 +96,72 @@ def _history() -> dict:
     return {"python": platform.python_version(), **versions, "git": git or "none"}
 
 
-def _name(thing) -> str:
-    """A function by its module and name, a partial one with its arguments, a value by what it prints."""
+def _name(thing, seen: tuple = ()) -> str:
+    """A function of a package by module and name, one of a user by name and code, a value by what it prints.
+
+    seen: the functions on the way to this one, for they may call each other.
+    """
+    name = lambda a: _name(a, seen)
     if isinstance(thing, partial):
-        words = [_name(a) for a in thing.args] + [f"{k}={_name(v)}" for k, v in sorted(thing.keywords.items())]
-        return f"{_name(thing.func)}({', '.join(words)})"
-    if callable(thing):
-        return f"{thing.__module__}.{thing.__qualname__}"
-    if isinstance(thing, tuple):
-        return f"({', '.join(_name(a) for a in thing)})"
-    if isinstance(thing, (np.ndarray, jax.Array)):
-        return str(_plain(thing))
-    return repr(thing)
+        words = [name(a) for a in thing.args] + [f"{k}={name(v)}" for k, v in sorted(thing.keywords.items())]
+        return f"{name(thing.func)}({', '.join(words)})"
+    if isinstance(thing, (np.ndarray, np.generic, jax.Array)):
+        key = jax.dtypes.issubdtype(thing.dtype, jax.dtypes.prng_key)
+        return str(_plain(jax.random.key_data(thing) if key else thing))
+    if isinstance(thing, Mapping):
+        return f"{{{', '.join(f'{name(k)}: {name(v)}' for k, v in thing.items())}}}"
+    if isinstance(thing, (tuple, list)):
+        return f"({', '.join(map(name, thing))})"
+    if isinstance(thing, (set, frozenset)):
+        return f"{{{', '.join(sorted(map(name, thing)))}}}"
+    if isinstance(thing, ModuleType):
+        return thing.__name__ if _packaged(thing.__name__) else "a module"
+    plain = thing if isinstance(thing, FunctionType) else getattr(thing, "__wrapped__", thing)  # within jit
+    if hasattr(plain, "__qualname__") and hasattr(plain, "__module__"):
+        if _packaged(plain.__module__ or "builtins"):
+            return f"{plain.__module__}.{plain.__qualname__}"
+        if isinstance(plain, FunctionType) and plain not in seen:
+            crc = zlib.crc32(_meaning(plain, (*seen, plain)).encode())
+            return f"{plain.__qualname__} (code of Python {'.'.join(map(str, sys.version_info[:2]))}, crc32 {crc:08x})"
+        return plain.__qualname__
+    return re.sub(r" at 0x[0-9a-f]+", "", repr(thing))
+
+
+_PACKAGES = tuple(str(Path(sysconfig.get_path(name)).resolve()) for name in ("stdlib", "purelib", "platlib"))
+
+
+def _packaged(module: str) -> bool:
+    """Whether a module is ours, comes with Python or is installed, rather than written by the user."""
+    if module == "__main__" or module not in sys.modules:
+        return False
+    file = getattr(sys.modules[module], "__file__", None)
+    ours = module.split(".")[0] == __name__.split(".")[0]
+    return ours or file is None or str(Path(file).resolve()).startswith(_PACKAGES)
+
+
+def _meaning(function: FunctionType, seen: tuple) -> str:
+    """What decides the numbers of a function: code, defaults, captured values, and what it uses of its own module."""
+    captured = []
+    for cell in function.__closure__ or ():
+        try:
+            captured.append(cell.cell_contents)
+        except ValueError:  # not yet set
+            captured.append("nothing yet")
+    used = {name: function.__globals__[name] for name in _globals(function.__code__) if name in function.__globals__}
+    parts = function.__defaults__, function.__kwdefaults__, captured, used
+    return f"{_code(function.__code__)} {_name(parts, seen)}"
+
+
+def _globals(code: CodeType) -> list[str]:
+    """Names of the globals that a code reads, also within the functions that it makes."""
+    names = {i.argval for i in dis.get_instructions(code) if i.opname in ("LOAD_GLOBAL", "LOAD_NAME")}
+    return sorted(names.union(*(_globals(part) for part in code.co_consts if isinstance(part, CodeType))))
+
+
+def _code(code: CodeType) -> str:
+    """The code without where it stands: no file, no line."""
+    constants = [_code(part) if isinstance(part, CodeType) else _name(part) for part in code.co_consts]
+    return f"{code.co_code.hex()} {constants} {code.co_names} {code.co_varnames} {code.co_freevars}"
 
 
 def _plain(leaf):

@@ -6,7 +6,6 @@ May import: check, noise, sweeping, draw, provenance, read, store, summary.
 from __future__ import annotations
 
 import pickle
-import warnings
 from collections.abc import Callable, Collection, Iterator
 from concurrent.futures import Executor, as_completed
 from functools import lru_cache
@@ -153,7 +152,7 @@ def _complete(store: Store, campaign: Campaign, mine: range, executor: Executor 
     states = {block: state_of(store, block) for block in mine}
     damaged = [block for block, state in states.items() if state == "damaged"]
     if damaged:
-        warnings.warn(f"{store.path.name}: blocks {damaged} are damaged and computed again.", stacklevel=4)
+        check.warn(f"{store.path.name}: blocks {damaged} are damaged and computed again.")
     missing = [block for block, state in states.items() if state != "done"]
     done = [block for block, state in states.items() if state == "done"]
     length = lambda blocks: sum(stop - start for start, stop in map(store.span, blocks))
