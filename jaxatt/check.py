@@ -41,13 +41,18 @@ def concrete(tree) -> bool:
     return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
-_batch: ContextVar[int | None] = ContextVar("number of scenarios that are checked at once", default=None)
+_batch: ContextVar[tuple] = ContextVar(
+    "number of scenarios that are checked, whether params are shared", default=(None, False)
+)
 
 
 @contextmanager
-def scenarios(n: int | None):
-    """Within it, the last axis of length n of what is checked holds the scenarios; None: there is just one."""
-    token = _batch.set(n)
+def scenarios(n: int | None, params: Any = ()):
+    """Within it, the last axis of length n of what is checked holds the scenarios; None: there is just one.
+
+    params: what is named so and shared by the scenarios; () where there is nothing.
+    """
+    token = _batch.set((n, bool(jax.tree.leaves(params))))
     try:
         yield
     finally:
@@ -59,7 +64,7 @@ def each(name: str, must: str, value, good) -> None:
     value, good = np.broadcast_arrays(np.asarray(value), np.asarray(good))
     if not good.all():
         bad = tuple(int(i) for i in np.argwhere(~good)[0])
-        at, where = _place_of(bad, value.shape)
+        at, where = _place_of(name, bad, value.shape)
         raise ValueError(f"`{name}{at}` must {must}, but it is {float(value[bad]):g}{where}.")
 
 
@@ -69,10 +74,10 @@ def pair(name: str, must: str, value, other, holds) -> None:
         each(name, must, value, holds(np.asarray(value), np.asarray(other)))
 
 
-def _place_of(index: tuple, shape: tuple) -> tuple[str, str]:
+def _place_of(name: str, index: tuple, shape: tuple) -> tuple[str, str]:
     """Where in an array an index lies: the words behind the name, and those that tell the scenario."""
-    n, where = _batch.get(), ""
-    if n is not None and shape[-1:] == (n,):
+    (n, shared), where = _batch.get(), ""
+    if n is not None and shape[-1:] == (n,) and not (shared and name.lstrip("|").startswith("params")):
         index, where = index[:-1], f" in scenario {index[-1]}"
     return (f"[{', '.join(map(str, index))}]" if index else ""), where
 
@@ -182,7 +187,11 @@ def moments(name: str, matrix) -> np.ndarray | None:
 
 
 def inertia(name: str, matrix) -> None:
-    """Refuse a matrix that is the inertia of no body: see `moments`."""
+    """Refuse a matrix that is the inertia of no body: see `moments`.
+
+    Products of inertia are the tensor's own entries, J_xy = -sum(m x y); a mass-properties tool may list them without the
+    minus sign.
+    """
     moments(name, matrix)
 
 
@@ -344,12 +353,21 @@ def is_number(leaf) -> bool:
 
 def kind(name: str, value, wanted: type) -> None:
     """Refuse, with TypeError, what is not of the wanted type."""
-    if type(value) is not wanted:
-        raise TypeError(f"`{name}` must be a {wanted.__name__}, but it is {short(value)}.")
+    was = type(value)
+    if was is not wanted:
+        anew = (was.__module__, was.__qualname__) == (wanted.__module__, wanted.__qualname__)
+        said = (
+            f"of a {wanted.__name__} that has been defined anew: make it again after a reload" if anew else short(value)
+        )
+        raise TypeError(f"`{name}` must be a {wanted.__name__}, but it is {said}.")
 
 
 def kinds(params, Params: type, scenario, Scenario: type) -> None:
     """Refuse, with TypeError, params and scenarios of another loop."""
+    if type(scenario) is tuple and [type(part) for part in scenario] == [Params, Scenario]:
+        raise TypeError(
+            "`scenario` must be a Scenario, but it is a pair (params, scenario): `jaxatt.varied` takes pairs."
+        )
     kind("params", params, Params)
     kind("scenario", scenario, Scenario)
 

@@ -278,7 +278,7 @@ def validated(system: System, params, scenario, n: int | None = None) -> tuple[A
     params, scenario = prepared(system, params, scenario)
     last = scenario if n is None else jax.tree.map(_batch_last, scenario)
     fields.validate("params", params)
-    with check.scenarios(n):
+    with check.scenarios(n, params):
         fields.validate("scenario", last, n)
         if check.concrete((params, scenario)):
             system.check(params, last)

@@ -153,5 +153,6 @@ def _shaped(name: str, leaf, batch: tuple, lengths: dict, shapes: tuple) -> None
     )
     told = f"{wanted} in each scenario" if batch else wanted
     shown = (found[-1:] + found[:-1]) if batch else found
-    way_out = "" if batch or len(found) <= max(map(len, shapes)) else ": one scenario; `jaxatt.sweep` takes many"
+    many = "the same in all scenarios; `jaxatt.varied` takes others" if name.startswith("params") else "one scenario; `jaxatt.sweep` takes many"  # fmt: skip
+    way_out = "" if batch or len(found) <= max(map(len, shapes)) else f": {many}"
     check.refuse(name, f"have shape {told}{way_out}", f"of shape {shown}")

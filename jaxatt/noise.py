@@ -62,6 +62,10 @@ def chunk_noise(system: System, key, k0, ticks: int, lanes: tuple, dtype):
 def one_key(key):
     """The two raw words of a single key, typed or raw; TypeError for what is no key, ValueError for several."""
     if hasattr(key, "dtype") and jnp.issubdtype(key.dtype, prng_key):
+        if str(jax.random.key_impl(key)) != "threefry2x32":
+            raise TypeError(
+                f"`key` must be a threefry key, jax.random.key(seed), but it is one of {jax.random.key_impl(key)}."
+            )
         key = jax.random.key_data(key)
     if not hasattr(key, "dtype") or key.dtype != jnp.uint32 or key.shape[-1:] != (2,):
         raise TypeError(f"`key` must be a key of jax.random.key(seed), but it is {check.short(key)}.")

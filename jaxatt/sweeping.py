@@ -128,7 +128,11 @@ def _varied(loop: Any) -> Any:
     return loop._replace(**{name: partial(_of_pair, getattr(loop, name)) for name in names})
 
 
-def _of_pair(f, _, pair, *rest):
+def _of_pair(f, params, pair, *rest):
+    if jax.tree.leaves(params):
+        check.refuse(
+            "params", "be () for a varied loop, whose scenarios are pairs (params, scenario)", check.short(params)
+        )
     return f(*pair, *rest)
 
 

@@ -1,5 +1,7 @@
 """The grammar of a refusal, and what each check lets pass."""
 
+import importlib
+import runpy
 import warnings
 from pathlib import Path
 
@@ -200,3 +202,48 @@ def test_memory_is_known_and_what_exceeds_it_is_refused(monkeypatch):
     check.fits_memory("`ticks` = 3", 2 * 10**9, "ask for fewer")
     with pytest.raises(ValueError, match=r"^`ticks` = 3 takes 3 GB, but 2 GB of memory are free: ask for fewer\.$"):
         check.fits_memory("`ticks` = 3", 3 * 10**9, "ask for fewer")
+
+
+def test_a_class_that_was_reloaded_is_told_apart(tmp_path, monkeypatch):
+    (tmp_path / "reloaded_loop.py").write_text(
+        "from typing import NamedTuple\nclass Scenario(NamedTuple):\n    a: float = 1.0\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    module = importlib.import_module("reloaded_loop")
+    old = module.Scenario()
+    importlib.reload(module)
+    with pytest.raises(
+        TypeError, match="`scenario` must be a Scenario, but it is of a Scenario that has been defined anew"
+    ):
+        check.kind("scenario", old, module.Scenario)
+    with pytest.raises(TypeError, match=r"`scenario` must be a Scenario, but it is Vec3\("):
+        check.kind("scenario", Vec3(1.0, 2.0, 3.0), module.Scenario)
+
+
+def test_params_are_no_scenario_however_many_there_are():
+    """Five entries of params that five scenarios share: the entry is named, not a scenario."""
+    bad = np.array([1.0, 1.0, 1.0, 1.0, -1.0])
+    with check.scenarios(5, params=(1.0,)):
+        with pytest.raises(ValueError, match=r"`params\.P0\[4\]` must not be negative, but it is -1\."):
+            check.not_negative("params.P0", bad)
+        with pytest.raises(ValueError, match=r"`\|params\.q\|\[4\]` must be 1, but it is 2\."):
+            check.unit("params.q", (np.array([1.0, 1.0, 1.0, 1.0, 2.0]),))
+        with pytest.raises(ValueError, match=r"`scenario\.a` must not be negative, but it is -1 in scenario 4\."):
+            check.not_negative("scenario.a", bad)
+    with check.scenarios(5), pytest.raises(ValueError, match=r"`params\.k` must .* in scenario 4\."):
+        check.not_negative("params.k", bad)  # of a varied loop
+
+
+def test_a_warning_points_to_the_line_of_the_user(tmp_path):
+    """From a file outside the package, through any number of ours."""
+    file = tmp_path / "flight.py"
+    file.write_text(
+        "import numpy as np\nfrom jaxatt.attitude import quat_from_vector\nfrom jaxatt.loops import star_isolation as loop\n"
+        "from jaxatt.engine import validated\nfrom jaxatt.vec import Vec3\n\noff = Vec3(*map(float, quat_from_vector(Vec3(0.1, 0.0, 0.0))[1:]))\n"
+        "q = loop.scenario.q._replace(w=(1 - off @ off) ** 0.5, x=off.x, y=off.y, z=off.z)\n\n"
+        "def fly():\n    return validated(loop.system, loop.params, loop.scenario._replace(q=q))\n\nfly()\n"
+    )
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        runpy.run_path(str(file))
+    assert told and {(w.filename, w.lineno) for w in told} == {(str(file), 11)}

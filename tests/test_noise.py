@@ -71,3 +71,11 @@ def test_the_normal_quantile_is_exact_to_float32_rounding_over_its_range():
 def test_bad_input_is_refused(change, error, message):
     with pytest.raises(error, match=f"^{message}"):
         noise_of(**dict(system=SYSTEM, key=KEY, index=0, ticks=10) | change)
+
+
+@pytest.mark.parametrize("kind", ["rbg", "unsafe_rbg"])
+def test_a_key_of_another_generator_is_told_apart(kind):
+    with pytest.raises(
+        TypeError, match=rf"`key` must be a threefry key, jax\.random\.key\(seed\), but it is one of {kind}\."
+    ):
+        one_key(jax.random.key(5, impl=kind))

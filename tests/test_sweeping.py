@@ -13,7 +13,7 @@ import pytest
 from made_up import compilations, repeated
 from toy import SYSTEM, Params, Scenario
 
-from jaxatt import scores
+from jaxatt import check, scores
 from jaxatt.engine import simulate
 from jaxatt.noise import noise_of
 from jaxatt.sweeping import block_of, block_records, rerun, sweep, varied
@@ -236,3 +236,17 @@ def test_the_check_of_the_system_sees_the_scenarios_last():
 def test_equal_scenarios_of_a_repeated_one_meet_other_noise():
     found = swept(repeated(Scenario(), 130))
     assert len(np.unique(found["rms"])) == 130
+
+
+def test_params_and_pairs_are_not_mixed_up():
+    """A varied loop takes its params from pairs alone; another loop takes no pairs, and one set of params."""
+    pairs = repeated((Params(0.7), Scenario()), 2)
+    with pytest.raises(ValueError, match=r"`params` must be \(\) for a varied loop, whose scenarios are pairs"):
+        sweep(varied(SYSTEM), Params(0.3), pairs, KEY, ticks=TICKS, score=varied(score))
+    checked = SYSTEM._replace(check=lambda params, scenario: check.kinds(params, Params, scenario, Scenario))
+    with pytest.raises(TypeError, match=r"it is a pair \(params, scenario\): `jaxatt\.varied` takes pairs\."):
+        sweep(checked, Params(), pairs, KEY, ticks=TICKS, score=score)
+    with pytest.raises(
+        ValueError, match=r"have shape \(\): the same in all scenarios; `jaxatt\.varied` takes others, but"
+    ):
+        sweep(SYSTEM, Params(np.ones(2)), repeated(Scenario(), 2), KEY, ticks=TICKS, score=score)
