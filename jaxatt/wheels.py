@@ -38,10 +38,10 @@ class Wheel(NamedTuple):
     dead_drive: Annotated[Any, "deg/s^2", finite, not_negative] = 0.0  # at rest the drive counts only beyond it
     slow: Annotated[Any, "deg/s", limit] = 1500.0  # speed y_s beyond which weakness, dead_drive and friction fade
     friction: Annotated[Any, "deg/s^2", finite, not_negative] = 0.0  # deceleration F; Coulomb's with slow = inf
-    creep: Annotated[Any, "deg/s", limit] = 100.0  # speed eps over which friction turns round without stiction
+    creep: Annotated[Any, "deg/s", limit] = 100.0  # speed eps over which friction without stiction turns round
     stiction: Annotated[Any, "deg/s^2", finite, not_negative] = 0.0  # the least that breaks a wheel away from rest
     stribeck: Annotated[Any, "deg/s", limit] = 10.0  # speed over which stiction falls to friction once it turns
-    settle: Annotated[Any, "s", finite, positive] = 0.01  # time in which stiction brings rest; above a third of a step
+    settle: Annotated[Any, "s", finite, positive] = 0.01  # time in which stiction brings rest; at least 0.4 of a step
     viscous: Annotated[Any, "1/s", finite, not_negative] = 0.0  # friction that grows with speed, over speed
 
     def check(self, name: str) -> None:
