@@ -113,10 +113,18 @@ def start(system: System, params, scenario, n: int):
     return over_lanes(one, n)(scenario)
 
 
-def step(system: System, params, scenario, n: int, k, state, noise):
-    """One tick in n lanes and the flow to the next: the instant, the state ahead and the log."""
+def times(system: System, params, scenario, k):
+    """Number and time of the ticks k, (ticks,) of integers: of many at once, lest every use of a time works it out."""
+    return k, time_of(k, system.dt, check.float_type((params, scenario)))
+
+
+def step(system: System, params, scenario, n: int, at, state, noise):
+    """One tick in n lanes and the flow to the next: the instant, the state ahead and the log.
+
+    at: number and time of the tick, one of `times`.
+    """
     dtype = check.float_type((params, scenario))
-    now = Now(k, time_of(k, system.dt, dtype), system.dt)
+    now = Now(*at, system.dt)
 
     def tick(scenario, x, z, noise):
         out = system.tick(params, scenario, now, x, z, noise)
@@ -153,24 +161,25 @@ def run(
     """
 
     @jax.checkpoint
-    def one(carry, k, n_k):
+    def one(carry, at, n_k):
         state, tally = carry
-        now, state, log = step(system, params, scenario, n, k, state, n_k)
+        now, state, log = step(system, params, scenario, n, at, state, n_k)
         tally, out = fold(tally, now, log)
         return (state, tally), out
 
     if ticks % chunk:
         one = jax.jit(one, inline=True)  # traced once for its shapes and its values
 
-    def guarded(carry, kn):
+    def guarded(carry, told):
         if ticks % chunk == 0:
-            return one(carry, *kn)
-        _, shapes = jax.eval_shape(one, carry, *kn)
-        return jax.lax.cond(kn[0] < ticks, one, lambda carry, k, n: (carry, zeros(shapes)), carry, *kn)
+            return one(carry, *told)
+        _, shapes = jax.eval_shape(one, carry, *told)
+        return jax.lax.cond(told[0][0] < ticks, one, lambda carry, at, n: (carry, zeros(shapes)), carry, *told)
 
     @jax.checkpoint
     def many(carry, c):
-        carry, outs = jax.lax.scan(guarded, carry, (c * chunk + jnp.arange(chunk), noise(c)))
+        at = times(system, params, scenario, c * chunk + jnp.arange(chunk))
+        carry, outs = jax.lax.scan(guarded, carry, (at, noise(c)))
         return carry, keep(carry[1], outs)
 
     chunks = -(-ticks // chunk)
@@ -248,9 +257,8 @@ def _simulate(system, ticks, every, keyed, params, scenario, source):
         return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:ticks], logs)
 
     def at_start():
-        return alone(
-            step(system, params, scenario, 1, jnp.asarray(0), start(system, params, scenario, 1), noise(0)[0])[2]
-        )
+        at, none = jax.tree.map(lambda a: a[0], (times(system, params, scenario, jnp.arange(1)), noise(0)))
+        return alone(step(system, params, scenario, 1, at, start(system, params, scenario, 1), none)[2])
 
     def hold(held, now, log):  # in the carry, so that what is not kept takes no memory
         return jax.tree.map(partial(jnp.where, now.k % every == 0), alone(log), held), None

@@ -16,7 +16,7 @@ import numpy as np
 from jaxatt import check
 from jaxatt.compiling import compiled
 from jaxatt.contract import System
-from jaxatt.engine import start, step, validated
+from jaxatt.engine import start, step, times, validated
 
 
 def sampled(
@@ -108,8 +108,8 @@ def _lane(scenario):
 def _matrix(system, ticks, after, params, scenario):
     first, scenario = _first(system, params, scenario), _lane(scenario)
     noise = jnp.zeros((system.normals, 1), check.float_type((params, scenario)))
-    one = lambda state, k: (step(system, params, scenario, 1, k, state, noise)[1], None)
-    run = lambda state, first, n: jax.lax.scan(one, state, first + jnp.arange(n))[0]
+    one = lambda state, at: (step(system, params, scenario, 1, at, state, noise)[1], None)
+    run = lambda state, first, n: jax.lax.scan(one, state, times(system, params, scenario, first + jnp.arange(n)))[0]
     leaves, tree = jax.tree.flatten(run(first, 0, after))
     moving = [i for i, a in enumerate(leaves) if _floating(a)]
     ends = np.cumsum([leaves[i].size for i in moving])[:-1]

@@ -14,6 +14,7 @@ from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxatt import check, scores
 from jaxatt.vec import safe_sqrt
@@ -80,12 +81,14 @@ class Delay(NamedTuple):
 
     waited: Any = 0.0  # [s]
     silent: Any = 1.0  # [1] probability of no alarm so far
+    rest: Any = 0.0  # [s] what rounding has left out of the time
 
     def __add__(self, later):
-        return Delay(self.waited + self.silent * later.waited, self.silent * later.silent)
+        waited, rest = scores.plus(self.waited, self.rest, self.silent * later.waited, self.silent * later.rest)
+        return Delay(waited, self.silent * later.silent, rest)
 
     def value(self):
-        return self.waited
+        return self.waited + self.rest
 
 
 class Detection(NamedTuple):
@@ -104,8 +107,9 @@ def detection(now, probability, onset, start=0.0) -> Detection:
     """
     faulty, quiet = now.t >= onset, (now.t < onset) & (now.t >= start)
     silent = jnp.where(faulty, 1 - probability, 1)
+    waited = jnp.where(faulty, now.dt * silent, 0)
     return Detection(
-        delay=Delay(jnp.where(faulty, now.dt * silent, 0), silent),
+        delay=Delay(waited, silent, jnp.zeros_like(waited)),
         miss=scores.mean(1 - probability, faulty),
         false_alarms=scores.mean(probability, quiet),
     )
@@ -120,13 +124,12 @@ class SoftSettling(NamedTuple):
     time: Any = 0.0  # [s]
     inside: Any = 1.0  # [1] probability of not having been outside
     length: Any = 0.0  # [s] of the window so far
+    rest: Any = 0.0  # [s] what rounding has left out of the length
 
     def __add__(self, later):
-        return SoftSettling(
-            self.length - later.inside * (self.length - self.time) + later.time,
-            self.inside * later.inside,
-            self.length + later.length,
-        )
+        length, rest = scores.plus(self.length, self.rest, later.length, later.rest)
+        back = (1 - later.inside) * (self.length + self.rest - self.time)
+        return SoftSettling(self.time + back + later.time, self.inside * later.inside, length, rest)
 
     def value(self):
         return self.time
@@ -137,9 +140,10 @@ def soft_settling(now, outside, inside: Any = True) -> SoftSettling:
 
     The plain sum of ``outside`` would not see that an overshoot leaves the band once more, late but briefly.
     """
-    out = jnp.where(inside, outside, 0)
+    inside = scores.truth(inside)
+    out = jnp.where(inside, scores.real(outside), 0)
     length = jnp.where(inside, now.dt * jnp.ones_like(out), 0)
-    return SoftSettling(length * out, 1 - out, length)
+    return SoftSettling(length * out, 1 - out, length, jnp.zeros_like(length))
 
 
 # chatter
@@ -152,30 +156,34 @@ class Chatter(NamedTuple):
     """
 
     total: Any = 0.0  # sum of squares of the changes
-    ticks: Any = 0.0  # [1] number of ticks in it
+    ticks: Any = 0  # [1] number of ticks in it
     first: Any = 0.0  # first value
     last: Any = 0.0  # last value
+    rest: Any = 0.0  # what rounding has left out of the sum
 
     def __add__(self, later):
         jump = jnp.where((self.ticks > 0) & (later.ticks > 0), later.first - self.last, 0)
+        total, rest = scores.plus(self.total, self.rest, jump * jump + later.total, later.rest)
         return Chatter(
-            self.total + jump * jump + later.total,
+            total,
             self.ticks + later.ticks,
             jnp.where(self.ticks > 0, self.first, later.first),
             jnp.where(later.ticks > 0, later.last, self.last),
+            rest,
         )
 
     def value(self):
-        some = self.ticks > 1
-        return jnp.where(some, safe_sqrt(self.total / jnp.where(some, self.ticks - 1, 1)), jnp.nan)
+        total = jnp.asarray(self.total + self.rest)
+        jumps = jnp.asarray(self.ticks, total.dtype) - 1
+        return jnp.where(jumps > 0, safe_sqrt(total / jnp.where(jumps > 0, jumps, 1)), jnp.nan)
 
 
 def chatter(value, inside: Any = True) -> Chatter:
     """Tally how much ``value``, a command, jumps from tick to tick in one window: the wear of an actuator."""
-    value = jnp.asarray(value, jnp.result_type(value, 1.0))
-    there = jnp.broadcast_to(jnp.asarray(inside, value.dtype), value.shape)
-    kept = jnp.where(there > 0, value, 0)
-    return Chatter(jnp.zeros_like(value), there, kept, kept)
+    value, inside = scores.real(value), scores.truth(inside)
+    kept = jnp.where(inside, value, 0)
+    nothing = jnp.zeros_like(kept)
+    return Chatter(nothing, jnp.broadcast_to(inside.astype(np.int32), kept.shape), kept, kept, nothing)
 
 
 # estimators

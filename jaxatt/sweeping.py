@@ -21,7 +21,7 @@ from tqdm import tqdm
 from jaxatt import check, scores
 from jaxatt.compiling import compiled, shared, traced
 from jaxatt.contract import Score, System
-from jaxatt.engine import over_lanes, run, start, step, tree_bytes, validated
+from jaxatt.engine import over_lanes, run, start, step, times, tree_bytes, validated
 from jaxatt.noise import BLOCK, CHUNK, block_key, chunk_noise, one_key
 
 
@@ -153,12 +153,14 @@ def block_scores(system: System, score: Callable, ticks, params, scenarios, key,
         return over_lanes(one, BLOCK)(scenarios, log)
 
     @partial(jax.jit, inline=True)  # traced once for its shapes and its values
-    def ahead(state, k, n):
-        now, state, log = step(system, params, scenarios, BLOCK, k, state, n)
+    def ahead(state, at, n):
+        now, state, log = step(system, params, scenarios, BLOCK, at, state, n)
         return state, tallied(now, log)
 
     state = start(system, params, scenarios, BLOCK)
-    shapes = jax.eval_shape(ahead, state, jnp.asarray(0), noise(0)[0])[1]
+    instants = lambda c: times(system, params, scenarios, c * CHUNK + jnp.arange(CHUNK))
+    taken = lambda tree, i: jax.tree.map(lambda a: a[i], tree)
+    shapes = jax.eval_shape(ahead, state, *taken((instants(0), noise(0)), 0))[1]
     nothing = jax.tree.map(scores.empty, shapes, is_leaf=scores.is_tally)
     add = over_lanes(scores.add, BLOCK)
 
@@ -168,10 +170,10 @@ def block_scores(system: System, score: Callable, ticks, params, scenarios, key,
     else:
 
         def chunk(c, carry):
-            here = noise(c)
+            here = instants(c), noise(c)
 
             def one(i, carry):
-                state, more = ahead(carry[0], c * CHUNK + i, here[i])
+                state, more = ahead(carry[0], *taken(here, i))
                 return state, add(carry[1], more)
 
             return jax.lax.fori_loop(0, jnp.minimum(CHUNK, ticks - c * CHUNK), one, carry)
@@ -227,7 +229,8 @@ def scored(system, params, scenarios, key, ticks, score, first: int = 0, advance
         if block < blocks:
             ticks, params, key = at[block % len(devices)]  # they decide where it runs
             here = block_of(scenarios, block)
-            under_way.append(call(system, score, ticks, params, here, key, np.int32(first + block)))
+            with jax.debug_nans(False), jax.debug_infs(False):  # a NaN is the answer where a window was empty
+                under_way.append(call(system, score, ticks, params, here, key, np.int32(first + block)))
         if under_way and block >= 2 * len(devices) - 1:
             done.append(jax.tree.map(np.asarray, under_way.popleft()))
             advance(min(BLOCK, n - (len(done) - 1) * BLOCK))

@@ -86,3 +86,65 @@ def test_a_tree_of_tallies_becomes_the_same_tree_of_numbers():
         TypeError, match=r"^`score` must return a tree of tallies, such as scores\.rms\(x\), but it holds 3"
     ):
         scores.empty(3.0)
+
+
+# long runs and odd values
+
+
+def long_run(tally_of, ticks):
+    """The value of a tally that takes the same number at every one of so many ticks, in float32."""
+    one = jax.tree.map(jnp.asarray, tally_of(np.float32(0.1)))
+    run = lambda ticks: jax.lax.fori_loop(0, ticks, lambda _, sum_: scores.add(sum_, one), scores.empty(one))
+    return scores.values(jax.jit(run)(ticks))
+
+
+@pytest.mark.parametrize("ticks", [10**5, 864_000, 8_640_000, 20 * 10**6])
+@pytest.mark.parametrize(
+    ("tally_of", "right"),
+    [
+        (scores.mean, lambda n: 0.1),
+        (lambda v: scores.rms(v * v), lambda n: 0.1),
+        (scores.total, lambda n: 0.1 * n),
+        (lambda v: scores.mean(v > 0), lambda n: 1),
+    ],
+)
+def test_sums_of_float32_are_right_at_any_length(tally_of, right, ticks):
+    assert long_run(tally_of, ticks) == pytest.approx(right(ticks), rel=2e-7)
+
+
+def test_the_forward_derivative_of_a_long_mean_is_right_too():
+    one = jax.tree.map(jnp.asarray, scores.mean(np.float32(0.1)))
+
+    def mean(v):
+        step = lambda sum_, _: (scores.add(sum_, scores.mean(v)), None)
+        return scores.values(jax.lax.scan(step, scores.empty(one), None, length=10**6)[0])
+
+    assert jax.jvp(mean, (np.float32(0.1),), (np.float32(1),))[1] == pytest.approx(1, rel=2e-7)
+
+
+def test_an_infinite_value_makes_an_infinite_mean():
+    bad = lambda now, v: jnp.where(now.k == 7, jnp.inf, v)
+    assert total(lambda now, v, i: scores.mean(bad(now, v))) == np.inf
+    assert total(lambda now, v, i: scores.total(bad(now, v))) == np.inf
+
+
+@pytest.mark.parametrize("value", [2, 2.0, True, np.int64(2), np.float64(2), np.array(2), np.float32(2), np.uint8(2)])
+def test_every_tally_takes_a_number_of_any_type(value):
+    right = dict(mean=value, rms=2**0.5 if value is not True else 1, peak=value, final=value, span=0, total=40 * value, always=1, first=0,
+                 settling=np.inf, peak_time=0)  # fmt: skip
+    timed = {"first", "settling", "peak_time"}
+    with jax.numpy_dtype_promotion("strict"):
+        for name, number in right.items():
+            tally = getattr(scores, name)
+            found = total(lambda now, v, i, t=tally, n=name: t(now, value) if n in timed else t(value))
+            assert found == pytest.approx(float(number)), name
+
+
+def test_a_window_may_be_a_number_or_of_another_shape():
+    assert total(lambda now, v, i: scores.mean(v, 1.0 * i)) == pytest.approx(VALUES[INSIDE].mean())
+    assert scores.values(scores.mean(2.0, np.array([True, False]))).tolist()[0] == 2
+    assert scores.values(scores.settling(Now(3, 1.5, 0.5), True, np.array([True, False]))).tolist()[0] == np.inf
+
+
+def test_nan_is_no_truth():
+    assert not scores.truth(np.nan) and scores.truth(2) and not scores.truth(0.0)
