@@ -21,5 +21,7 @@ def delayed(line, age):
     An age outside [0, k - 1] gives the newest or the oldest sample. NaN counts only where it is asked for.
     """
     last = line.shape[0] - 1
-    weight = jnp.maximum(1 - jnp.abs(jnp.arange(last + 1) - jnp.clip(age, 0, last)), 0)
+    weight = jnp.maximum(
+        1 - jnp.abs(jnp.arange(last + 1, dtype=line.dtype) - jnp.clip(jnp.asarray(age, line.dtype), 0, last)), 0
+    )
     return jnp.sum(weight * jnp.where(weight > 0, line, 0))

@@ -187,7 +187,7 @@ def final(value) -> Final:
 
 def finite(tree):
     """Whether every number of a tree is finite."""
-    total = sum(jnp.sum(leaf) for leaf in jax.tree.leaves(tree))  # one inf or NaN makes the sum inf or NaN
+    total = sum(jnp.sum(real(leaf)) for leaf in jax.tree.leaves(tree))  # one inf or NaN makes the sum inf or NaN
     return jnp.isfinite(total)
 
 

@@ -353,3 +353,13 @@ def test_every_paper_has_a_study_of_its_gains():
 
     for name in NAMES:
         assert callable(importlib.import_module(f"{STUDIES['tune']}.{name}").run)
+
+
+def test_a_check_of_a_gradient_that_is_not_finite_says_so():
+    with pytest.raises(ValueError, match=r"^`cost` must be finite at theta, but it is nan\.$"):
+        gradient_check(lambda theta, key: theta["a"] * jnp.nan, dict(a=1.0), KEY)
+    steep = lambda theta, key: theta["a"] + jnp.sqrt(theta["b"])
+    with pytest.raises(
+        ValueError, match=r"^`cost` must have a finite gradient at theta, along theta\['b'\] too, but it is inf\.$"
+    ):
+        gradient_check(steep, dict(a=1.0, b=0.0), KEY, forward=False)

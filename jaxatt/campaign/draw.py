@@ -176,6 +176,10 @@ def variables(campaign: Campaign) -> dict[str, Variable]:
     if refused(campaign.system, params, scenarios).all():
         validated(campaign.system, params, scenarios, BLOCK)
     scores = score_shapes(campaign.system, params, scenarios, campaign.key, campaign.ticks, campaign.score)
+    ok = named(scores, "score").get("ok")
+    if ok is not None and (ok.dtype != bool or ok.shape != (BLOCK,)):
+        found = f"{ok.dtype} of shape {ok.shape[:-1]}"
+        check.refuse("campaign.score", "give one bool of each scenario for ok, such as scores.always(...)", found)
     inputs = jax.tree.map(lambda a: np.moveaxis(a, 0, -1), inputs)
     trees: dict[str, Any] = {"status": {"status": np.zeros(BLOCK, np.int8)}, "score": scores, "input": inputs}
     if campaign.record is not None:

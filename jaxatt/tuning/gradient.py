@@ -104,7 +104,7 @@ def gradient_check(cost: Callable, theta, key, *, step: float | None = None, for
 
     Raises:
         TypeError: a cost that is no scalar, a key that is none.
-        ValueError: a step that is not positive.
+        ValueError: a step that is not positive; a cost, or a gradient, that is not finite.
 
     Example:
         >>> found = gradient_check(cost, theta, jax.random.key(0), step=0.02)
@@ -126,6 +126,15 @@ def gradient_check(cost: Callable, theta, key, *, step: float | None = None, for
         both = jitted(lambda flat, key: value_and_gradient(at, flat, key, forward=False))
         gradient = np.asarray(both(flat, key)[1])
         value = lambda flat: float(both(flat, key)[0])
+    here = value(flat)
+    if not np.isfinite(here):
+        check.refuse("cost", "be finite at theta", here)
+    if not np.isfinite(gradient).all():
+        paths = [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(theta)]
+        sizes = [np.size(leaf) for leaf in jax.tree.leaves(theta)]
+        names = [name for name, size in zip(paths, sizes) for _ in range(size)]
+        at = int(np.argmin(np.isfinite(gradient)))
+        check.refuse("cost", f"have a finite gradient at theta, along theta{names[at]} too", gradient[at])
     h = np.finfo(flat.dtype).eps ** 0.2 if step is None else step
     central, doubt = np.zeros((2, flat.size))
     for i in range(flat.size):
