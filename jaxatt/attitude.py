@@ -38,8 +38,16 @@ def wrapped(a, turn: Any = 2 * pi):
 
     turn: one turn in the unit of a (`full_turn`); inf where a is no angle and stays what it is.
     """
+    return nearest_angle(a, 0, turn)
+
+
+def nearest_angle(a, b, turn: Any = 2 * pi):
+    """The angle a less whole turns, within half a turn of b: what a sensor that starts anew at a turn means.
+
+    turn: as of `wrapped`.
+    """
     is_angle = jnp.isfinite(turn)
-    turns = jnp.round(a / jnp.where(is_angle, turn, 1))
+    turns = jnp.round((a - b) / jnp.where(is_angle, turn, 1))
     return a - jnp.where(is_angle, turn, 0) * turns
 
 

@@ -9,7 +9,6 @@ import hashlib
 import logging
 import os
 import platform
-import warnings
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -100,10 +99,9 @@ def configure(cache: str | Path | None = None) -> Path:
         present = os.environ.get("XLA_FLAGS", "")
         wanted = [f"{name}={value}" for name, value in _FLAGS.items() if name not in present]
         if wanted and _has_run():
-            warnings.warn(
+            check.warn(
                 "`jaxatt.configure` comes after the first computation of JAX: the compiler's flags have no effect any "
-                "more, and sweeps run two to three times slower. Call it first.",
-                stacklevel=2,
+                "more, and sweeps run two to three times slower. Call it first."
             )
         elif wanted:
             os.environ["XLA_FLAGS"] = " ".join([present, *wanted]).strip()

@@ -718,3 +718,18 @@ def test_a_late_reading_is_missing_when_it_was_taken_in_the_gap():
         z = z._replace(sensors=sensors)
         there.append(bool(sensors.readings.theta.valid))
     assert there == [True, True, True, True, False, False, True, True]  # ticks 52 and 53 read between 49.5 and 50.5
+
+
+@pytest.mark.parametrize("differenced", [0.0, 1.0])
+@pytest.mark.parametrize("turns", [-2, 1])
+def test_a_sensor_that_starts_anew_at_a_turn_changes_nothing(differenced, turns):
+    p = wm.params._replace(blend=0.3, differenced=differenced)
+    memory = wm.Memory(LeastSquares(-1e-4, 1e-7), 650.0, 0.0, 179.9, True, -1000.0, 0.1)
+    computer, now = wm.Computer(Mrac(700.0, 0.9, 0.3), -1010.0, memory), Now(jnp.asarray(9), 0.18, wm.DT)
+    read = lambda theta: wm.Readings(Reading(theta, True), Reading(700.0, True))
+    for a, b in zip(
+        jax.tree.leaves(wm.decide(p, now, computer, read(180.2))),
+        jax.tree.leaves(wm.decide(p, now, computer, read(180.2 + 360 * turns))),
+        strict=True,
+    ):
+        np.testing.assert_allclose(b, a, rtol=1e-9)

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxatt import check, scores
+from jaxatt.attitude import nearest_angle
 from jaxatt.check import a_number, finite, flag, not_negative, positive
 from jaxatt.compiling import shared
 from jaxatt.contract import System
@@ -249,6 +250,9 @@ def decide(params: Params, now, computer: Computer, readings: Readings):
     from the reference model.
     """
     mrac, turns, last = computer
+    expected = last.theta + last.estimate.a * (turns - last.turns)
+    reading = nearest_angle(readings.theta.value, expected, 360.0)  # a sensor may start anew at a turn
+    readings = readings._replace(theta=readings.theta._replace(value=reading))
     estimate, flipped = estimated(params, now, computer, readings)
     target, target_rate = slew(params, now.t)
     moved = estimate.a * (turns - last.turns)
