@@ -2,12 +2,15 @@
 
 The line is held between ticks, an array (k,) with the newest sample first; its length bounds the age.
 
-May import: nothing of ours.
+May import: clock.
 """
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
+
+from jaxatt.clock import NEAR
 
 
 def pushed(line, newest):
@@ -18,10 +21,18 @@ def pushed(line, newest):
 def delayed(line, age):
     """The sample that is ``age`` [ticks] old, between two samples linearly interpolated; differentiable in both.
 
-    An age outside [0, k - 1] gives the newest or the oldest sample. NaN counts only where it is asked for.
+    An age outside [0, k - 1] gives the newest or the oldest sample. An age that two roundings of float32 part from a
+    whole tick (`clock.NEAR`) is that tick; its derivative is the one towards the older sample. NaN counts only where it
+    is asked for.
     """
     last = line.shape[0] - 1
-    weight = jnp.maximum(
-        1 - jnp.abs(jnp.arange(last + 1, dtype=line.dtype) - jnp.clip(jnp.asarray(age, line.dtype), 0, last)), 0
-    )
-    return jnp.sum(weight * jnp.where(weight > 0, line, 0))
+    age = jnp.clip(jnp.asarray(age, line.dtype), 0, last)
+    held = jax.lax.stop_gradient(age)
+    tick = jnp.round(held)
+    age = age + jnp.where(jnp.abs(held - tick) <= NEAR * held + 1e-9, tick - held, 0)
+    held = jax.lax.stop_gradient(age)
+    first = jnp.floor(held)
+    number = jnp.arange(last + 1, dtype=line.dtype)
+    newer, older = (jnp.sum(jnp.where(number == at, line, 0)) for at in (first, jnp.minimum(first + 1, last)))
+    older = jnp.where((held > first) | jnp.isfinite(older), older, newer)
+    return (1 - (age - first)) * newer + (age - first) * older

@@ -40,3 +40,21 @@ def test_gradients_in_samples_and_age():
     by_line, by_age = jax.grad(delayed, (0, 1))(LINE, 1.25)
     np.testing.assert_allclose(by_line, [0, 0.75, 0.25, 0])
     assert float(by_age) == pytest.approx(7.0 - -2.0)
+
+
+@pytest.mark.parametrize("real", [np.float32, np.float64])
+@pytest.mark.parametrize("whole", [1, 2, 3, 5, 6])
+def test_an_age_that_rounding_parts_from_a_whole_tick_is_that_tick(whole, real):
+    """delay / dt of a delay that means whole ticks is off by two roundings at most: neighbours that are NaN stay out."""
+    values = np.arange(8.0, dtype=real)
+    line = jnp.asarray(np.where(np.arange(8) == whole, values, np.nan))
+    ages = {whole, np.nextafter(real(whole), real(0)), np.nextafter(real(whole), real(9)), 5.0000005 * whole / 5}
+    ages |= {real(whole * dt) / real(dt) for dt in (0.01, 0.1, 0.3, 1 / 3)}
+    assert [float(delayed(line, real(age))) for age in ages] == [whole] * len(ages)
+    assert np.isnan(delayed(line, real(whole + 1e-5))) and np.isnan(delayed(line, real(whole - 1e-5)))
+
+
+def test_a_whole_age_has_the_slope_towards_the_older_sample():
+    slope = jax.grad(lambda age: delayed(LINE, age))
+    assert float(slope(1.0)) == 7.0 - -2.0 and float(slope(2.0)) == 1.0 - 7.0
+    assert float(slope(5.0)) == 0 and float(jax.grad(lambda age: delayed(LINE.at[2].set(jnp.nan), age))(1.0)) == 0

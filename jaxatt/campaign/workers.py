@@ -1,6 +1,6 @@
 """Who computes a campaign: this process, or the workers of an executor; this process alone writes.
 
-May import: check, noise, sweeping, draw, provenance, read, store, summary.
+May import: check, clock, noise, sweeping, draw, provenance, read, store, summary.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ from jaxatt.campaign.store import (
     write_block,
 )
 from jaxatt.campaign.summary import Rate, narrowed
+from jaxatt.clock import time_of
 from jaxatt.noise import BLOCK
 from jaxatt.sweeping import progress_bar
 
@@ -136,7 +137,7 @@ def _refuse_fork(executor) -> None:
 def _prepared(path: Path, campaign: Campaign, n: int, grow: bool, accept) -> Store:
     """The store, created if there is none, for n scenarios."""
     if not path.exists():
-        times = np.arange(0, campaign.ticks, campaign.every) * campaign.system.dt
+        times = time_of(np.arange(0, campaign.ticks, campaign.every), campaign.system.dt, np.float64)
         create(path, variables(campaign), manifest_of(campaign, n), None if campaign.record is None else times)
         return open_store(path, "r+")
     store = open_store(path, "r+")
