@@ -55,7 +55,9 @@ def chunk_noise(system: System, key, k0, ticks: int, lanes: tuple, dtype):
     if system.normals == 0:
         return jnp.zeros((ticks, *shape), dtype)
     keys = jax.vmap(lambda k: jax.random.key_data(jax.random.fold_in(jax.random.wrap_key_data(key), k)))
-    bits = shared(lambda k0: jax.vmap(lambda key: _words(key, shape))(keys(k0 + jnp.arange(ticks))), k0)
+    bits = shared(
+        lambda k0: jax.vmap(lambda key: _words(key, shape))(keys(k0 + jnp.arange(ticks, dtype=jnp.result_type(k0)))), k0
+    )
     return shared(_normal, bits).astype(dtype)  # cast outside: within, float64 would halve the width of all of it
 
 

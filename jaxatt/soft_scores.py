@@ -37,6 +37,7 @@ def weighted(terms, weights: dict):
         >>> cost = weighted(found, dict(rms_q=100.0, rms_u=0.02))
     """
     terms = terms._asdict() if hasattr(terms, "_asdict") else terms
+    scores.tell("term", {name: terms[name] for name in weights})
     return sum(weight * jnp.mean(terms[name]) for name, weight in weights.items())
 
 

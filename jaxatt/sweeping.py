@@ -158,7 +158,7 @@ def block_scores(system: System, score: Callable, ticks, params, scenarios, key,
         return state, tallied(now, log)
 
     state = start(system, params, scenarios, BLOCK)
-    instants = lambda c: times(system, params, scenarios, c * CHUNK + jnp.arange(CHUNK))
+    instants = lambda c: times(system, params, scenarios, c * CHUNK + jnp.arange(CHUNK, dtype=np.int32))
     taken = lambda tree, i: jax.tree.map(lambda a: a[i], tree)
     shapes = jax.eval_shape(ahead, state, *taken((instants(0), noise(0)), 0))[1]
     nothing = jax.tree.map(scores.empty, shapes, is_leaf=scores.is_tally)
@@ -284,4 +284,7 @@ def _traced(system, score, ticks, params, scenarios, key, n):
         return block_scores(system, score, ticks, params, scenarios, key, block)
 
     out = jax.lax.map(one, (jnp.arange(blocks), jax.tree.map(split, scenarios)))
-    return jax.tree.map(lambda a: jnp.moveaxis(a, -1, 1).reshape(-1, *a.shape[1:-1])[:n], out)
+    out = jax.tree.map(lambda a: jnp.moveaxis(a, -1, 1).reshape(-1, *a.shape[1:-1])[:n], out)
+    name = lambda path: jax.tree_util.keystr(path, simple=True, separator=".")
+    scores.tell("score", {name(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(out)})
+    return out

@@ -21,7 +21,7 @@ from jaxatt.loops import gyro_ekf as ge
 from jaxatt.loops import observer_pd as op
 from jaxatt.loops import star_isolation as si
 from jaxatt.loops import wheel_mrac as wm
-from jaxatt.soft_scores import soft_alarm
+from jaxatt.soft_scores import soft_alarm, weighted
 from jaxatt.tuning import (
     FEW,
     averaged,
@@ -363,3 +363,48 @@ def test_a_check_of_a_gradient_that_is_not_finite_says_so():
         ValueError, match=r"^`cost` must have a finite gradient at theta, along theta\['b'\] too, but it is inf\.$"
     ):
         gradient_check(steep, dict(a=1.0, b=0.0), KEY, forward=False)
+
+
+# a cost that is not finite, traced to what it is made of
+
+
+def gappy(theta, key, pick=lambda found: weighted(found, dict(error=1.0, late=0.5))):
+    """Mean costs of five runs of two seconds; ``late`` is a mean over a window that two of them lack."""
+    score = lambda params, scenario, now, log: dict(
+        error=scores.mean(log * log), late=scores.mean(log * log, now.t >= scenario), unused=scores.mean(log, False)
+    )
+    loop = System(
+        init=lambda params, scenario: (0.0 * scenario + params, ()),
+        tick=lambda params, scenario, now, x, z, noise: (x, z, x),
+        flow=lambda params, scenario, t, x, z: -x,
+        dt=0.1,
+    )  # fmt: skip
+    begins = jnp.array([0.0, 1.0, 2.5, 1.0, 9.0])
+    return pick(sweep(loop, theta, begins, key, ticks=20, score=score))
+
+
+LATE = r"its term late is nan in 2 of 5 scenarios, first in scenario 2\.$"
+
+
+@pytest.mark.parametrize("cost", [gappy, jax.jit(gappy, static_argnames="pick"), averaged(gappy, 2)])
+def test_a_cost_that_is_nan_is_traced_to_its_term_and_scenario(cost):
+    with pytest.raises(ValueError, match="`cost` must be finite, .* at the start, but it is nan, .*; " + LATE):
+        tune(cost, 1.0, optax.sgd(0.1), 2, KEY)
+    with pytest.raises(ValueError, match="^`cost` must be finite at theta, but it is nan; " + LATE):
+        gradient_check(cost, 1.0, KEY)
+
+
+def test_a_cost_without_terms_is_traced_to_the_scores_of_its_sweep():
+    cost = lambda theta, key: gappy(theta, key, lambda found: jnp.mean(found["late"]))
+    with pytest.raises(ValueError, match="; its score late is nan in 2 of 5 scenarios, first in scenario 2; its score"):
+        multi_start(cost, np.ones(2), optax.sgd(0.1), 2, KEY, fresh=True)
+    fine = lambda theta, key: gappy(theta, key, lambda found: jnp.mean(found["error"]))
+    assert np.isfinite(tune(fine, 1.0, optax.sgd(0.1), 1, KEY)[1].cost).all()
+
+
+def test_a_term_that_is_nan_beside_theta_is_found_too():
+    terms = lambda theta, key: weighted(dict(plain=theta, root=jnp.sqrt(theta - 1)), dict(plain=1.0, root=1.0))
+    with pytest.raises(
+        ValueError, match=r"finite beside theta, for theta = 0\.9995.* too, but it is nan; its term root is"
+    ):
+        gradient_check(terms, 1.0001, KEY, step=1e-3)

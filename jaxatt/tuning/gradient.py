@@ -1,6 +1,6 @@
 """The gradient of a cost, and whether to believe it.
 
-May import: check, compiling, noise.
+May import: check, compiling, noise, scores.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from jaxatt import check
+from jaxatt import check, scores
 from jaxatt.compiling import jitted
 from jaxatt.noise import one_key
 
@@ -64,6 +64,36 @@ def _scalar(cost: Callable, theta, key) -> None:
 # whether to believe a gradient
 
 
+def blamed(cost: Callable, theta, *keys) -> str:
+    """Which parts make a cost not finite, as the end of a message; "" where none says so. One evaluation for each key.
+
+    Parts are the terms of `soft_scores.weighted`; of a cost without it, the scores of its sweeps.
+    """
+    scores.told.clear()
+    before = scores.listening.set(True)
+    try:
+        # another precision of products, which are none: what jit traced before and keeps, tells nobody
+        with jax.debug_nans(False), jax.debug_infs(False), jax.default_matmul_precision("highest"):
+            for key in keys:
+                jax.block_until_ready(jax.jit(lambda theta, key: cost(theta, key))(theta, key))
+            jax.effects_barrier()
+    finally:
+        scores.listening.reset(before)
+    words = []
+    for kind in ("term", "score"):
+        found = [(name, np.asarray(a)) for of, parts in scores.told if of == kind for name, a in parts.items()]
+        for name, a in {name: a for name, a in found if not np.isfinite(a).all()}.items():
+            bad = ~np.isfinite(a)
+            said = f"its {kind} {name} is {a[bad][0]}"
+            if a.ndim:
+                bad = bad.reshape(len(a), -1).any(1)
+                said += f" in {bad.sum()} of {len(a)} scenarios, first in scenario {np.argmax(bad)}"
+            words.append(said)
+        if words:
+            break
+    return "".join(f"; {said}" for said in words[:3])
+
+
 def floats(name: str, theta):
     """The tree theta with floating arrays for leaves; TypeError, by ``name``, for what holds no numbers."""
     if not jax.tree.leaves(check.numbers(name, theta)):
@@ -104,7 +134,8 @@ def gradient_check(cost: Callable, theta, key, *, step: float | None = None, for
 
     Raises:
         TypeError: a cost that is no scalar, a key that is none.
-        ValueError: a step that is not positive; a cost, or a gradient, that is not finite.
+        ValueError: a step that is not positive; a cost, at theta or beside it, or a gradient that is not finite. The
+            message says which term of `soft_scores.weighted`, or which score of a sweep, in which scenario.
 
     Example:
         >>> found = gradient_check(cost, theta, jax.random.key(0), step=0.02)
@@ -128,18 +159,26 @@ def gradient_check(cost: Callable, theta, key, *, step: float | None = None, for
         value = lambda flat: float(both(flat, key)[0])
     here = value(flat)
     if not np.isfinite(here):
-        check.refuse("cost", "be finite at theta", here)
+        check.refuse("cost", "be finite at theta", f"{here}{blamed(at, flat, key)}")
+    paths = [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(theta)]
+    sizes = [np.size(leaf) for leaf in jax.tree.leaves(theta)]
+    names = [name for name, size in zip(paths, sizes) for _ in range(size)]
     if not np.isfinite(gradient).all():
-        paths = [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(theta)]
-        sizes = [np.size(leaf) for leaf in jax.tree.leaves(theta)]
-        names = [name for name, size in zip(paths, sizes) for _ in range(size)]
-        at = int(np.argmin(np.isfinite(gradient)))
-        check.refuse("cost", f"have a finite gradient at theta, along theta{names[at]} too", gradient[at])
+        i = int(np.argmin(np.isfinite(gradient)))
+        check.refuse("cost", f"have a finite gradient at theta, along theta{names[i]} too", gradient[i])
     h = np.finfo(flat.dtype).eps ** 0.2 if step is None else step
     central, doubt = np.zeros((2, flat.size))
     for i in range(flat.size):
         size = h * max(1.0, abs(float(flat[i])))
-        d = lambda by, i=i, size=size: value(flat.at[i].add(by * size))
+
+        def d(by, i=i, size=size):
+            moved = flat.at[i].add(by * size)
+            beside = value(moved)
+            if not np.isfinite(beside):
+                must = f"be finite beside theta, for theta{names[i]} = {moved[i]:.9g} too"
+                check.refuse("cost", must, f"{beside}{blamed(at, moved, key)}")
+            return beside
+
         inner, middle, outer = d(0.5) - d(-0.5), (d(1) - d(-1)) / 2, (d(2) - d(-2)) / 4
         central[i] = (4 * inner - middle) / 3 / size
         doubt[i] = abs(central[i] - (4 * middle - outer) / 3 / size)

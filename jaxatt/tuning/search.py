@@ -24,7 +24,7 @@ from jaxatt.compiling import jitted
 from jaxatt.noise import one_key
 from jaxatt.sweeping import progress_bar
 from jaxatt.tuning.bounds import bounded, ends_of
-from jaxatt.tuning.gradient import floats, value_and_gradient
+from jaxatt.tuning.gradient import blamed, floats, value_and_gradient
 
 # the search
 
@@ -81,8 +81,9 @@ def tune(
         The best theta met, and the `History`.
 
     Raises:
-        ValueError: the cost is not finite at the start; steps < 1 or fewer than the file holds; a file of another
-            search (cost, start, optimizer, key or release of JAX).
+        ValueError: the cost is not finite at the start: the message says which term of `soft_scores.weighted`, or which
+            score of a sweep, in which scenario; steps < 1 or fewer than the file holds; a file of another search (cost,
+            start, optimizer, key or release of JAX).
         TypeError: the cost is no scalar, theta holds no numbers, or the optimizer is none of optax.
 
     Example:
@@ -92,7 +93,8 @@ def tune(
     steps, key, theta = check.whole("steps", steps), one_key(key), floats("theta", theta)
     check.a_number("theta", theta)
     step = lambda search, key, k: _step(cost, optimizer, forward, fresh, search, key, k)
-    best, history = _run(step, _start(optimizer, theta), steps, key, save, progress)
+    why = lambda keys: blamed(cost, theta, *keys)
+    best, history = _run(step, _start(optimizer, theta), steps, key, fresh, save, progress, why)
     return best.theta, history
 
 
@@ -128,7 +130,8 @@ def multi_start(
     one = lambda search, key, k: _step(cost, optimizer, forward, fresh, search, key, k)
     step = jax.vmap(one, in_axes=(0, None, None))
     start = jax.vmap(lambda theta: _start(optimizer, theta))(thetas)
-    best, history = _run(step, start, steps, key, save, progress)
+    why = lambda keys: blamed(cost, jax.tree.map(lambda a: a[0], thetas), *keys)
+    best, history = _run(step, start, steps, key, fresh, save, progress, why)
     return jax.tree.map(lambda a: a[np.argmin(best.cost)], best.theta), history
 
 
@@ -168,10 +171,15 @@ def _check_search(cost, optimizer) -> None:
         check.function(f"optimizer.{name}", getattr(optimizer, name, None))
 
 
+def _none(kind) -> float:
+    """The least cost before there was any: no inf, which jax_debug_infs would stop."""
+    return np.finfo(kind).max
+
+
 def _start(optimizer, theta) -> _Search:
     kind = check.float_type(theta)
     state = optimizer.init(theta)
-    return _Search(theta, state, jnp.ones((), kind), _Best(jnp.full((), jnp.inf, kind), theta, state))
+    return _Search(theta, state, jnp.ones((), kind), _Best(jnp.full((), _none(kind), kind), theta, state))
 
 
 def _step(cost, optimizer, forward, fresh: bool, search: _Search, key, k):
@@ -196,24 +204,30 @@ def _step(cost, optimizer, forward, fresh: bool, search: _Search, key, k):
     return _Search(theta, state, jnp.where(fine, factor, factor / 2), best), (judged, size)
 
 
-def _run(step: Callable, search: _Search, steps: int, key, save, progress) -> tuple[_Best, History]:
-    """All steps, one compiled call each, so that a bar can move and a file can follow."""
+def _run(
+    step: Callable, search: _Search, steps: int, key, fresh, save, progress, why: Callable
+) -> tuple[_Best, History]:
+    """All steps, one compiled call each, so that a bar can move and a file can follow.
+
+    why: (keys) -> which parts of the cost are not finite at the (first) start.
+    """
     key = jax.random.wrap_key_data(jnp.asarray(key))
     search = jax.device_get(search)
-    lowered = jitted(step).lower(search, key, np.int32(0))
+    step = jitted(step)
     trail: list[History] = []
     if save is not None:
-        path, mark = check.place("save", save), _mark(lowered, search, key)
+        path, mark = check.place("save", save), _mark(step.lower(search, key, np.int32(0)), search, key)
         search, trail = _resumed(path, mark, search, steps)
-    step = lowered.compile()
     with progress_bar(progress, steps, " steps") as bar:
         bar.update(len(trail))
         for k in range(len(trail), steps):
             at = search
             search, (value, size) = jax.device_get(step(search, key, np.int32(k)))
             trail.append(History(at.theta, value, size, at.factor))
-            if not np.isfinite(search.best.cost).any():
-                check.refuse("cost", "be finite, with a finite gradient, at the start", value)
+            if (search.best.cost == _none(search.best.cost.dtype)).all():
+                met = f"{np.ravel(value)[0]}, with a gradient of {np.ravel(size)[0]}"
+                seen = why([key, jax.random.fold_in(key, k)] if fresh else [key])
+                check.refuse("cost", "be finite, with a finite gradient, at the start", met + seen)
             if save is not None:
                 _saved(path, mark, search, trail)
             bar.set_postfix(cost=f"{np.min(search.best.cost):.4g}", refresh=False)
