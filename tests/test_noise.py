@@ -61,7 +61,7 @@ def test_the_normal_quantile_is_exact_to_float32_rounding_over_its_range():
     [
         (dict(key=7), TypeError, r"`key` must be a key of jax\.random\.key\(seed\), but it is 7"),
         (dict(key=np.zeros(2)), TypeError, r"`key` must be a key .* of shape \(2,\) and type float64"),
-        (dict(key=jax.random.key(0, impl="rbg")), TypeError, "`key` must be a key of "),
+        (dict(key=jax.random.key(0, impl="rbg")), TypeError, "`key` must be a threefry key, "),
         (dict(key=jax.random.split(KEY, 3)), ValueError, r"`key` must be one key, but it is of shape \(3,\)"),
         (dict(index=-1), ValueError, "`index` must be a whole number of at least 0, but it is -1"),
         (dict(ticks=0), ValueError, "`ticks` must be a whole number of at least 1, but it is 0"),
