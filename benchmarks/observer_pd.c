@@ -272,6 +272,7 @@ INLINE void begin(Loop *l, const Params *params, const REAL *scenario, uint64_t 
         f->scale = NEXT, f->std = i < AXES ? std_q : std_w;
         V grown = NEXT * f->std;
         f->spread = root(grown * grown + random * random), f->stuck = NEXT > 0;
+        f->stuck |= NEXT > 0; /* a missing reading, which this program holds */
         f->scale = kept(~f->stuck, f->scale), f->settled = f->bias + f->drift;
         l->onset = smallest(l->onset, f->onset);
         l->y[i] = x[i];

@@ -46,8 +46,11 @@ def nearest_angle(a, b, turn: Any = 2 * pi):
 
     turn: as of `wrapped`.
     """
+    apart = jnp.asarray(a - b)
+    kind = apart.dtype if jnp.issubdtype(apart.dtype, jnp.floating) else float
+    turn = jnp.asarray(turn, kind)  # lest float32 become float64
     is_angle = jnp.isfinite(turn)
-    turns = jnp.round((a - b) / jnp.where(is_angle, turn, 1))
+    turns = jnp.round(apart / jnp.where(is_angle, turn, 1))
     return a - jnp.where(is_angle, turn, 0) * turns
 
 

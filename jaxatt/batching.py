@@ -67,9 +67,9 @@ def hoisted(f: Callable, example) -> tuple[Callable, list]:
     `jax.closure_convert` does the same, but for floating numbers only.
     """
     program, shape = jax.make_jaxpr(f, return_shape=True)(example)
-    tree = jax.tree.structure(shape)
+    tree, jaxpr = jax.tree.structure(shape), program.jaxpr  # g holds no consts, which are tracers
 
     def g(closure, x):
-        return jax.tree.unflatten(tree, eval_jaxpr(program.jaxpr, closure, x))
+        return jax.tree.unflatten(tree, eval_jaxpr(jaxpr, closure, x))
 
     return g, list(program.consts)

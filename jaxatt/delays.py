@@ -2,15 +2,13 @@
 
 The line is held between ticks, an array (k,) with the newest sample first; its length bounds the age.
 
-May import: clock.
+May import: nothing of ours.
 """
 
 from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-
-from jaxatt.clock import NEAR
 
 
 def pushed(line, newest):
@@ -21,15 +19,14 @@ def pushed(line, newest):
 def delayed(line, age):
     """The sample that is ``age`` [ticks] old, between two samples linearly interpolated; differentiable in both.
 
-    An age outside [0, k - 1] gives the newest or the oldest sample. An age that two roundings of float32 part from a
-    whole tick (`clock.NEAR`) is that tick; its derivative is the one towards the older sample. NaN counts only where it
-    is asked for.
+    An age outside [0, k - 1] gives the newest or the oldest sample. An age that a few roundings part from a
+    whole tick is that tick; its derivative is the one towards the older sample. NaN counts only where it is asked for.
     """
     last = line.shape[0] - 1
     age = jnp.clip(jnp.asarray(age, line.dtype), 0, last)
     held = jax.lax.stop_gradient(age)
     tick = jnp.round(held)
-    age = age + jnp.where(jnp.abs(held - tick) <= NEAR * held + 1e-9, tick - held, 0)
+    age = age + jnp.where(jnp.abs(held - tick) <= 8 * jnp.finfo(line.dtype).eps * tick, tick - held, 0)
     held = jax.lax.stop_gradient(age)
     first = jnp.floor(held)
     number = jnp.arange(last + 1, dtype=line.dtype)

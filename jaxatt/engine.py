@@ -124,7 +124,8 @@ def step(system: System, params, scenario, n: int, at, state, noise):
     at: number and time of the tick, one of `times`.
     """
     dtype = check.float_type((params, scenario))
-    now = Now(*at, system.dt)
+    k, t = at
+    now = Now(k, t, system.dt)
 
     def tick(scenario, x, z, noise):
         out = system.tick(params, scenario, now, x, z, noise)

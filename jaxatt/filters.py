@@ -116,7 +116,8 @@ def nees(belief: Belief, truth, period: Any = None):
     It is the NIS of the whole state measured without noise, and needs no solver. NaN: P is no covariance. period: (n,) one
     turn of each component that is an angle, inf for the others, as in `update`.
     """
-    e = _residual(truth, jnp.asarray(belief.mean), period)
+    mean = jnp.asarray(belief.mean)
+    e = _residual(jnp.asarray(truth, mean.dtype), mean, period)
     at_zero = Belief(jnp.zeros_like(e), belief.cov)
     return update(at_zero, Reading(e, jnp.ones(e.shape, bool)), lambda x: x, jnp.zeros_like(e))[1].nis
 
@@ -207,9 +208,11 @@ def _update(h: Callable, belief: Belief, reading: Reading, R, period, triangle=T
     expected, H, HP = _expected(h, belief)
     due = reading.valid & jnp.isfinite(reading.value) & ~jnp.isposinf(R)
     value = jnp.where(due, _residual(jnp.where(due, reading.value, 0), expected, period), 0)
-    impossible = jnp.any(due & ~(R >= 0), axis=0) | ~jnp.all(_rows(lambda i: P[i, i], n) >= 0, axis=0)
+    # not ~(R >= 0): of R = s * s the compiler takes that for False, NaN or not
+    impossible = jnp.any(due & ((R < 0) | jnp.isnan(R)), axis=0) | ~jnp.all(_rows(lambda i: P[i, i], n) >= 0, axis=0)
     noise = jnp.where(due & (R >= 0), R, 1)
     number = jnp.finfo(x.dtype)
+    rounding = 16 * number.eps * (jnp.abs(jnp.where(due, reading.value, 0)) + jnp.abs(expected))
 
     def one(i, carry):
         D, E, e, *_ = carry
@@ -225,7 +228,8 @@ def _update(h: Callable, belief: Belief, reading: Reading, R, period, triangle=T
         new = due[i] & ~(s <= least)
         root = jax.lax.rsqrt(jnp.maximum(s, least))
         scale = jnp.where(new & ~impossible, root, 0)
-        e_i = jnp.where(due[i], r * root, 0)
+        # where the measurements before it determine this one, its residual contradicts them beyond rounding or is none
+        e_i = jnp.where(due[i] & (new | (jnp.abs(r) > rounding[i])), r * root, 0)
         rows = scale * g, scale * Hg, e_i, jnp.where(new, s, 1), new
         return tuple(a.at[i].set(row) for a, row in zip(carry, rows))
 

@@ -15,10 +15,10 @@ from jaxatt.vec import Mat3, Vec3, cross, inverse, safe_sqrt
 
 
 class AttitudeRate(NamedTuple):
-    """An attitude and a body rate: truth, reading, estimate or residual."""
+    """An attitude and a body rate: truth, reading, estimate or residual; each a `Vec3`, or a `Reading` of one."""
 
-    q: Annotated[Vec3, "1"]  # MRP
-    w: Annotated[Vec3, "rad/s"]  # body rate
+    q: Annotated[Any, "1"]  # MRP
+    w: Annotated[Any, "rad/s"]  # body rate
 
 
 def mrp_observer(estimate: AttitudeRate, y: AttitudeRate, u: Vec3, J: Mat3, alpha, beta) -> AttitudeRate:

@@ -188,7 +188,9 @@ def final(value) -> Final:
 
 def finite(tree):
     """Whether every number of a tree is finite."""
-    total = sum(jnp.sum(real(leaf)) for leaf in jax.tree.leaves(tree))  # one inf or NaN makes the sum inf or NaN
+    leaves = [leaf for leaf in jax.tree.leaves(tree) if jnp.issubdtype(jnp.result_type(leaf), jnp.floating)]
+    kind = np.result_type(np.float32, *(jnp.result_type(leaf) for leaf in leaves))
+    total = sum(jnp.sum(leaf).astype(kind) for leaf in leaves)  # one inf or NaN makes the sum inf or NaN
     return jnp.isfinite(total)
 
 

@@ -138,7 +138,7 @@ def update_three(belief, y: Reading, h: Callable, expected: Vec3, variance):
     P = symmetric(len(P), lambda i, j: _less(P[i][j], K[i] @ PH[j], i == j))  # P - K M K'
     nis = jnp.where(definite, r @ (M_inv @ r), jnp.nan)
     nll = jnp.where(there, 0.5 * (nis + jnp.log(size) + 3 * log(2 * pi)), 0)
-    return x, P, Innovation(r, M, nis, jnp.where(there, 3.0, 0.0), nll)
+    return x, P, Innovation(r, M, nis, jnp.where(there, 3, jnp.zeros_like(nis)), nll)
 
 
 def _less(p, q, is_variance: bool):

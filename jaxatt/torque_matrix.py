@@ -61,6 +61,7 @@ class OrderedMinors(NamedTuple):
 
 
 def ordered_minors(t: Vec3) -> OrderedMinors:
+    """All products of two columns and determinants of three of T, by their order."""
     pairs = cross(Vec3(*(c[:, None] for c in t)), t)
     return OrderedMinors(pairs, Vec3(*(c[:, None, None] for c in t)) @ pairs)
 

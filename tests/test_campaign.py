@@ -1,6 +1,7 @@
 import errno
 import json
 import os
+import re
 import runpy
 import subprocess
 import sys
@@ -19,8 +20,8 @@ import xarray as xr
 import zarr
 
 from benchmarks import tiny_campaign as tiny
-from jaxatt import simulate, sweep
-from jaxatt.campaign import dataset, extend, rerun, run, scenarios, until, workers
+from jaxatt import scores, simulate, sweep
+from jaxatt.campaign import dataset, draw, extend, rerun, run, scenarios, until, workers
 from jaxatt.campaign.draw import checked, results
 from jaxatt.campaign.provenance import environment, manifest_of
 from jaxatt.campaign.store import lock_file
@@ -367,7 +368,7 @@ def test_another_campaign_is_refused_by_name(whole, tmp_path, monkeypatch):
         run(path, tiny.campaign(sample=sample), N)
 
     class Sample:  # says that it is the other one
-        __wrapped__ = tiny.sample
+        __wrapped__ = staticmethod(tiny.sample)
         __call__ = staticmethod(sample)
 
     sample = Sample()
@@ -413,6 +414,25 @@ def test_what_is_no_campaign_is_refused(tmp_path):
             run(tmp_path / "x.zarr", tiny.campaign(**change), 10)
     with pytest.raises(ValueError, match=r"`shard` must be \(k, m\) with k < m, but it is \(3, 3\)"):
         run(tmp_path / "x.zarr", tiny.campaign(), 10, shard=(3, 3))
+    assert not (tmp_path / "x.zarr").exists()
+
+
+@pytest.mark.parametrize(
+    ("ok", "found"),
+    [(scores.mean(1.0), "float64 of shape ()"), (scores.always(np.ones(3, bool)), "bool of shape (3,)")],
+)
+def test_an_ok_that_is_no_bool_per_scenario_is_refused_before_a_block_is_run(ok, found, tmp_path, monkeypatch):
+    def never(*_, **__):
+        raise AssertionError("a block was run")
+
+    for name in ("scored", "block_records"):
+        monkeypatch.setattr(draw, name, never)
+    monkeypatch.setattr(workers, "results", never)
+    message = (
+        f"`campaign.score` must give one bool of each scenario for ok, such as scores.always(...), but it is {found}."
+    )
+    with pytest.raises(ValueError, match=f"^{re.escape(message)}$"):
+        run(tmp_path / "x.zarr", tiny.campaign(score=lambda params, scenario, now, log: dict(ok=ok)), 10)
     assert not (tmp_path / "x.zarr").exists()
 
 
@@ -503,4 +523,4 @@ def test_a_script_is_resumed_and_rerun_by_its_import(tmp_path, monkeypatch):
     run(tmp_path / "x.zarr", study, 128)
     again = import_module("resumed_study").study
     data = extend(tmp_path / "x.zarr", again, 256)
-    assert data.sizes["scenario"] == 256 and len(rerun(tmp_path / "x.zarr", again, 130).t) == study.ticks
+    assert data.sizes["scenario"] == 256 and len(rerun(tmp_path / "x.zarr", again, 130).x) == study.ticks

@@ -201,8 +201,9 @@ def test_the_gyro_reads_rate_bias_and_noise():
     s = cmg.lost(P, (45, 45, 45, 45))._replace(bias_w=Vec3(1e-3, -2e-3, 3e-3), std_w=1e-4)
     x, z = cmg.init(cmg.params, s)
     read = cmg.sense(cmg.params, s, Now(0, 0.0, cmg.DT), x, z, jnp.array([1.0, 2.0, -3.0]))
-    np.testing.assert_allclose(array(read.w - x.w), [1.1e-3, -1.8e-3, 2.7e-3], rtol=1e-10)
-    assert read.healthy.tolist() == [1, 1, 1, 0] and (read.gamma == x.gamma).all()
+    np.testing.assert_allclose(array(read.w.value - x.w), [1.1e-3, -1.8e-3, 2.7e-3], rtol=1e-10)
+    assert read.healthy.tolist() == [1, 1, 1, 0] and (read.gamma.value == x.gamma).all()
+    assert read.w.valid and read.gamma.valid.all()
 
 
 def test_one_tick_is_the_equations_in_plain_numbers():

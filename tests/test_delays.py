@@ -48,8 +48,9 @@ def test_an_age_that_rounding_parts_from_a_whole_tick_is_that_tick(whole, real):
     """delay / dt of a delay that means whole ticks is off by two roundings at most: neighbours that are NaN stay out."""
     values = np.arange(8.0, dtype=real)
     line = jnp.asarray(np.where(np.arange(8) == whole, values, np.nan))
-    ages = {whole, np.nextafter(real(whole), real(0)), np.nextafter(real(whole), real(9)), 5.0000005 * whole / 5}
+    ages = {whole, np.nextafter(real(whole), real(0)), np.nextafter(real(whole), real(9))}
     ages |= {real(whole * dt) / real(dt) for dt in (0.01, 0.1, 0.3, 1 / 3)}
+    ages |= {5.0000005 * whole / 5} if real == np.float32 else set()
     assert [float(delayed(line, real(age))) for age in ages] == [whole] * len(ages)
     assert np.isnan(delayed(line, real(whole + 1e-5))) and np.isnan(delayed(line, real(whole - 1e-5)))
 

@@ -202,7 +202,8 @@ def test_tracers_pass_their_domain_but_not_their_shape():
 def test_simulate_and_sweep_refuse_by_the_fields():
     loop, key = observer_pd, jax.random.key(0)
     with pytest.raises(
-        ValueError, match=r"^`params\.k_q` must .* shape \(\): one scenario; `jaxatt\.sweep` takes many, "
+        ValueError,
+        match=r"^`params\.k_q` must .* shape \(\): the same in all scenarios; `jaxatt\.varied` takes others, ",
     ):
         simulate(loop.system, loop.params._replace(k_q=np.ones(3)), loop.scenario, key, ticks=3)
     skew = Mat3.of(np.diag([1.0, 1.0, 3.0]))

@@ -94,6 +94,18 @@ SCORES = [
     3,
     lambda params, scenario, now, log: log.u,
     lambda params, scenario, now, log: scores.final(np.ones(3)),
+    lambda params, scenario, now, log: [
+        scores.final(now.t),
+        scores.mean(True, False),
+        scores.total(now.k),
+        scores.rms(2, now.k),
+    ],
+    lambda params, scenario, now, log: (
+        scores.peak(now.k > 2, np.nan),
+        scores.settling(now, 1),
+        scores.first(now, log.u, since=now.k),
+    ),
+    lambda params, scenario, now, log: {"a": scores.mean(log.u), "b": 3.0},
 ]
 COSTS = [lambda theta, key: sum(jnp.sum(a**2) for a in jax.tree.leaves(theta)), None]
 VERBS = {

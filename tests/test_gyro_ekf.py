@@ -486,7 +486,8 @@ def test_the_consistent_filter_believes_the_true_noise():
 def test_the_error_reported_is_the_angle_less_the_commanded_one():
     slewing = params._replace(slew=Vec3(0.1, 0.2, 0.3), slew_start=0.0, slew_end=10.0)
     x = gyro_ekf.X(*[Vec3.of(np.array([0.3, 0.2, 0.1]))] * 3, h=np.zeros(4))
-    log = gyro_ekf.report(slewing, at(0, 20.0), x, np.zeros(4), None)
+    z = gyro_ekf.init_direct(params, gyro_ekf.scenario)[1]
+    log = gyro_ekf.report(slewing, gyro_ekf.scenario, at(0, 20.0), x, z, None)
     np.testing.assert_allclose(array(log.angle - log.error), array(gyro_ekf.target(slewing, 20.0).angle))
     assert np.abs(array(gyro_ekf.target(slewing, 20.0).angle)).max() > 0
 

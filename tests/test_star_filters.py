@@ -140,8 +140,9 @@ def test_the_error_of_an_impossible_covariance_is_no_number():
 
 def test_rounding_makes_no_variance_negative():
     """A measurement far better than the prior, in float32: 1 - 1 / (1 + 1e-12) rounds to or below zero."""
-    P = star_filters.diagonal(*np.float32([1.0, 3.0, 7.0]))
-    belief, y = star_filters.Belief(Vec3(*np.float32([0, 0, 0])), P), Reading(Vec3(*np.float32([1, 1, 1])), True)
+    single = lambda *a: np.array(a, np.float32)
+    P = star_filters.diagonal(*single(1, 3, 7))
+    belief, y = star_filters.Belief(Vec3(*single(0, 0, 0)), P), Reading(Vec3(*single(1, 1, 1)), True)
     h = lambda a: Vec3(a[0] + a[1], a[1] + a[2], a[2] + a[0])
     for _ in range(3):
         mean, P, told = star_filters.update_three(belief, y, h, h(belief.mean), np.float32(1e-6))

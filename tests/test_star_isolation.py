@@ -531,7 +531,7 @@ def test_scores_are_those_of_a_made_up_log():
         nees,
         nees,
         vectors(9, 2),
-        None,
+        None,  # pyright: ignore[reportArgumentType]
         None,  # pyright: ignore[reportArgumentType]
     )
     day = scenario._replace(star=star.on_sensor(PITCH, star.tangential(PITCH, Fault(onset=onset, end=3.3, bias=1.0))))

@@ -24,9 +24,11 @@ from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 import zarr
+from jax.dtypes import prng_key
 
 from jaxatt import check
 from jaxatt.campaign.draw import Campaign, named
@@ -106,8 +108,8 @@ def _name(thing, seen: tuple = ()) -> str:
         words = [name(a) for a in thing.args] + [f"{k}={name(v)}" for k, v in sorted(thing.keywords.items())]
         return f"{name(thing.func)}({', '.join(words)})"
     if isinstance(thing, (np.ndarray, np.generic, jax.Array)):
-        key = jax.dtypes.issubdtype(thing.dtype, jax.dtypes.prng_key)
-        return str(_plain(jax.random.key_data(thing) if key else thing))
+        key = jnp.issubdtype(thing.dtype, prng_key)
+        return str(_plain(jax.random.key_data(jnp.asarray(thing)) if key else thing))
     if isinstance(thing, Mapping):
         return f"{{{', '.join(f'{name(k)}: {name(v)}' for k, v in thing.items())}}}"
     if isinstance(thing, (tuple, list)):

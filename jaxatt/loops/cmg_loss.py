@@ -212,7 +212,8 @@ def decide(params: Params, now, computer: Computer, y: Readings):
         a = -torque / (params.module.I_ws * params.spin)  # eq. (7): the gimbals give -h_w T rate
         return integral, steer(params.steering, a, params.axes, gamma, y.healthy, now.t)
 
-    return Computer(*every(PERIOD, now, control, (computer.integral, computer.u)), w, gamma), ()
+    integral, u = every(PERIOD, now, control, (computer.integral, computer.u))
+    return Computer(integral, u, w, gamma), ()
 
 
 def tick(params: Params, scenario: Scenario, now, x: X, z: Z, noise):

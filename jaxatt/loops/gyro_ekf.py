@@ -221,7 +221,10 @@ def motors(scenario: Scenario, now) -> Channel:
 
 
 def driven(scenario: Scenario, z: Z, h) -> tuple[Any, Vec3]:
-    """Rates of the wheels' momenta (4,) that the motors make of the command, and their torque on the body [in-lbf]."""
+    """Rates of the wheels' momenta (4,) that the motors make of the command, and their torque on the body [in-lbf].
+
+    z: holds the command and the motors; h: (4,) wheel momenta [in-lbf-s].
+    """
     u = read(z.motors, wheel_rate(z.computer.u, h, scenario.torque_max, scenario.momentum_max))
     return u, -resultant(z.wheels, u)
 
@@ -339,7 +342,8 @@ def suspect(params: Params, now, computer: Computer, prior: Belief, y: Readings)
     joined = lambda weights, gyros: [*gyros, sum(weight * a for weight, a in zip(weights, gyros))]
     expected = lambda x: joined(v, gyros_read(params, x))
     readable = present(y.gyro)
-    value, R = jnp.stack(joined(v, known(y.gyro, jnp.zeros(4)))), jnp.stack(joined(v * v, params.R[GYRO]))
+    gyros = known(y.gyro, jnp.zeros_like(y.gyro.value))
+    value, R = jnp.stack(joined(v, gyros)), jnp.stack(joined(v * v, params.R[GYRO]))
     residual, variance = innovation(prior, value, expected, R)
     usable = jnp.append(readable & ~computer.dropped, jnp.all(readable)) & (now.k > 0)
     mean = jnp.where(usable, smoothed(computer.mean, residual / jnp.sqrt(variance), params.memory), computer.mean)

@@ -135,7 +135,7 @@ class Computer(NamedTuple):
     gyro: Vec3  # [rad/s] last reading: the prediction from k-1 to k uses that of k-1
     recent: Any  # (window, 2) [1] values of r' M^-1 r of the last stars
     latched: Any  # (2,) bool: alarms so far, for that of a constant fault ends by itself
-    cause: Any  # by latched alarms, when both filters last had a star
+    cause: Any  # () [1] by latched alarms, when both filters last had a star
 
 
 class X(NamedTuple):
