@@ -870,6 +870,7 @@ def faulty(n: int, seed: int):
             scale=np.ones(n),
             growth=np.where((kind == 2) & at_fault, np.maximum(size, 1), 1.0),
             stuck=np.zeros(n),
+            missing=np.zeros(n),
         )
 
     zero, cos, sin = np.zeros(n), np.cos(angle), np.sin(angle)
