@@ -7,8 +7,7 @@
 The first string is the unit, "1" for a pure number; a tuple is the shape of one scenario's value, () if there is none,
 several for alternatives, a name in it, ("n",), for a length that fields share; functions of (name, value), most of them
 of `jaxatt.check`, refuse what lies outside the domain; `jaxatt.check.instant` marks a time at which something starts or
-ends. The comment holds the meaning. What no single field can say, a
-method ``check(name)`` of the NamedTuple refuses.
+ends. The comment holds the meaning. What no single field can say, a method ``check(name)`` of the NamedTuple refuses.
 
 From it come the refusals of `simulate` and `sweep`, the units of stores, tables and figures, and the lists of fields in
 the documentation. A field without such an annotation is not checked.
@@ -153,6 +152,7 @@ def _shaped(name: str, leaf, batch: tuple, lengths: dict, shapes: tuple) -> None
     )
     told = f"{wanted} in each scenario" if batch else wanted
     shown = (found[-1:] + found[:-1]) if batch else found
-    many = "the same in all scenarios; `jaxatt.varied` takes others" if name.startswith("params") else "one scenario; `jaxatt.sweep` takes many"  # fmt: skip
+    shared = "the same in all scenarios; `jaxatt.varied` takes others"
+    many = shared if name.startswith("params") else "one scenario; `jaxatt.sweep` takes many"
     way_out = "" if batch or len(found) <= max(map(len, shapes)) else f": {many}"
     check.refuse(name, f"have shape {told}{way_out}", f"of shape {shown}")

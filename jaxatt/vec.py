@@ -346,8 +346,8 @@ def project(axes, v: Vec3):
 def resultant(axes, s) -> Vec3:
     """Sum of s[i] along n axes, s of shape (n,): W h for wheels.
 
-    axes: a tuple of `Vec3`, a `Vec3` of shape (n,) or an array (3, n). Raises ValueError or TypeError for anything else, and where s has not
-    as many numbers as there are axes.
+    axes: a tuple of `Vec3`, a `Vec3` of shape (n,) or an array (3, n). Raises ValueError or TypeError for anything else,
+    and where s has not as many numbers as there are axes.
     """
     vectors = columns(axes)
     if jnp.ndim(s) == 0 or len(s) != len(vectors):

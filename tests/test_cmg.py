@@ -9,6 +9,7 @@ jax.config.update("jax_enable_x64", True)
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 import pytest  # noqa: E402
+from clusters import FOUR, THREE, angles  # noqa: E402
 
 from jaxatt import cmg, fields  # noqa: E402
 from jaxatt.attitude import quat_rate, quat_rotate  # noqa: E402
@@ -21,32 +22,12 @@ from jaxatt.cmg import (  # noqa: E402
     cluster_momentum,
     cmg_axes,
     cmg_triads,
-    modules,
     steer,
 )
 from jaxatt.compiling import shared  # noqa: E402
 from jaxatt.engine import rk4  # noqa: E402
 from jaxatt.torque_matrix import gram_determinant  # noqa: E402
 from jaxatt.vec import Mat3, Quat, Vec3  # noqa: E402
-
-SKEWS = {"pyramid": 54.7, "box": 90.0}
-FOUR = {name: cmg_axes(np.radians(skew), np.radians([0.0, 90.0, 180.0, 270.0])) for name, skew in SKEWS.items()}
-THREE = {name: modules(axes, [0, 1, 2]) for name, axes in FOUR.items()}
-
-
-def torque(axes, gamma):
-    """Torque matrices at gimbal angles (n, m), components (n, m)."""
-    return cmg_triads(jax.tree.map(lambda a: a[:, None], axes), gamma).t
-
-
-def matrices(t):
-    """T of shape (m, 3, n)."""
-    return np.moveaxis(np.stack([np.asarray(c) for c in t]), -1, 0)
-
-
-def angles(n, m, seed=0):
-    return np.random.default_rng(seed).uniform(0, 2 * np.pi, (n, m))
-
 
 # mounting
 

@@ -6,35 +6,12 @@ jax.config.update("jax_enable_x64", True)
 
 import numpy as np  # noqa: E402
 import pytest  # noqa: E402
+from clusters import FOUR, SKEWS, THREE, matrices, over, torque  # noqa: E402
 
 from jaxatt import singularity as sg  # noqa: E402
 from jaxatt.cmg import GimbalAxes, cmg_axes, cmg_triads, modules  # noqa: E402
 from jaxatt.torque_matrix import condition  # noqa: E402
 from jaxatt.vec import Vec3  # noqa: E402
-
-SKEWS = {"pyramid": 54.7, "box": 90.0}
-FOUR = {name: cmg_axes(np.radians(skew), np.radians([0.0, 90.0, 180.0, 270.0])) for name, skew in SKEWS.items()}
-THREE = {name: modules(axes, [0, 1, 2]) for name, axes in FOUR.items()}
-
-
-def over(axes):
-    """Axes with room for grid points behind the modules."""
-    return jax.tree.map(lambda a: np.asarray(a)[:, None], axes)
-
-
-def torque(axes, gamma):
-    """Torque matrices at gimbal angles (n, m), components (n, m)."""
-    return cmg_triads(over(axes), gamma).t
-
-
-def matrices(t):
-    """T of shape (m, 3, n)."""
-    return np.moveaxis(np.stack([np.asarray(c) for c in t]), -1, 0)
-
-
-def angles(n, m, seed=0):
-    return np.random.default_rng(seed).uniform(0, 2 * np.pi, (n, m))
-
 
 COUNTS = {72: (9168, 22720), 120: (40976, 77312), 180: (137152, 229744), 360: (1104912, 2161632)}
 COUNTS[720] = (8808256, 16346560)

@@ -7,8 +7,9 @@ jax.config.update("jax_enable_x64", True)
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 import pytest  # noqa: E402
+from clusters import FOUR, SKEWS, THREE, angles, matrices, torque  # noqa: E402
 
-from jaxatt.cmg import cmg_axes, cmg_triads, modules  # noqa: E402
+from jaxatt.cmg import cmg_axes, cmg_triads  # noqa: E402
 from jaxatt.torque_matrix import (  # noqa: E402
     condition,
     condition_and_rank,
@@ -20,24 +21,6 @@ from jaxatt.torque_matrix import (  # noqa: E402
     singular_values,
 )
 from jaxatt.vec import Mat3, Vec3, array, columns  # noqa: E402
-
-SKEWS = {"pyramid": 54.7, "box": 90.0}
-FOUR = {name: cmg_axes(np.radians(skew), np.radians([0.0, 90.0, 180.0, 270.0])) for name, skew in SKEWS.items()}
-THREE = {name: modules(axes, [0, 1, 2]) for name, axes in FOUR.items()}
-
-
-def torque(axes, gamma):
-    """Torque matrices at gimbal angles (n, m), components (n, m)."""
-    return cmg_triads(jax.tree.map(lambda a: a[:, None], axes), gamma).t
-
-
-def matrices(t):
-    """T of shape (m, 3, n)."""
-    return np.moveaxis(np.stack([np.asarray(c) for c in t]), -1, 0)
-
-
-def angles(n, m, seed=0):
-    return np.random.default_rng(seed).uniform(0, 2 * np.pi, (n, m))
 
 
 @pytest.mark.parametrize("name", SKEWS)

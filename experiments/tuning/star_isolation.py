@@ -22,7 +22,7 @@ import optax
 from experiments.report import interval, plt
 from experiments.star_isolation import drawn
 from experiments.tuning import compare
-from jaxatt import Fault, Reading, Vec3, detection, evaluation, plot, scores, simulate, soft_scores, sweep, tune
+from jaxatt import Fault, Vec3, detection, evaluation, plot, scores, simulate, soft_scores, sweep, tune
 from jaxatt.compiling import compiled
 from jaxatt.loops import star_isolation as si
 from jaxatt.loops.star_isolation import DT, PITCH, ROLL
@@ -111,13 +111,13 @@ def residuals(params, data: Recorded):
 
     def step(carry, told):
         filters, gyro = carry
-        filters, innovation = si.advanced(LMMSE, params, filters, gyro, Reading(told.stars, np.ones(2, bool)), DT)
-        return (filters, told.gyro), innovation.nis
+        filters, innovation = si.advanced(LMMSE, params, filters, gyro, told.stars, DT)
+        return (filters, told.gyro.value), innovation.nis
 
     def one(readings, q_hat):
         filters = jax.vmap(partial(LMMSE.start, params))(q_hat)
         first, later = (jax.tree.map(lambda a, part=part: a[part], readings) for part in (0, slice(1, None)))
-        return jax.lax.scan(step, (filters, first.gyro), later)[1]
+        return jax.lax.scan(step, (filters, first.gyro.value), later)[1]
 
     return jax.vmap(one, out_axes=1)(data.readings, data.q_hat)
 

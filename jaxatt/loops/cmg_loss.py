@@ -53,9 +53,7 @@ class Params(NamedTuple):
     k_i: Annotated[Any, "1/s^2", not_negative] = 0.02  # integral gain of Table 4, against Table 5 (erratum 7): `table5`
     steering: Steering = Steering()
     axes: GimbalAxes = PYRAMID  # believed mounting of the n modules
-    J: Annotated[Mat3, "kg m^2", inertia] = (
-        INERTIA  # believed, without modules; products are the entries, J.x.y = -sum(m x y)
-    )
+    J: Annotated[Mat3, "kg m^2", inertia] = INERTIA  # believed, without modules; J.x.y = -sum(m x y)
     module: ModuleInertia = MODULE  # believed
     spin: Annotated[Any, "rad/s", positive] = SPIN  # believed wheel speed: h_w = I_ws spin
 

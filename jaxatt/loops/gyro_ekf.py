@@ -51,9 +51,7 @@ class Params(NamedTuple):
     k_p: Annotated[Vec3, "in-lbf/rad", finite] = Vec3(364.5, 364.5, 52.0)  # Table 3
     k_i: Annotated[Vec3, "in-lbf/(rad s)", finite] = Vec3(2.78125, 2.78125, 0.58984)  # Table 3
     k_d: Annotated[Vec3, "in-lbf s/rad", finite] = Vec3(11504.0, 11504.0, 1152.0)  # Table 3
-    J: Annotated[Mat3, "in-lbf-s^2", inertia] = (
-        INERTIA  # believed inertia; products are the entries, J.x.y = -sum(m x y)
-    )
+    J: Annotated[Mat3, "in-lbf-s^2", inertia] = INERTIA  # believed inertia; J.x.y = -sum(m x y)
     alpha: Annotated[Any, "rad", acute] = 54.7 * DEG  # believed gyro pyramid, Table 2
     beta: Annotated[Any, "rad", acute] = 60.0 * DEG
     gamma: Annotated[Any, "rad", acute] = 45.0 * DEG  # believed wheel pyramid, Table 2

@@ -217,7 +217,7 @@ def tick(params: Params, scenario: Scenario, now, x: X, z: Z, noise):
 def flow(params: Params, scenario: Scenario, t, x: X, z: Z) -> X:
     """dx/dt between ticks: sensors are read continuously, with the errors that the tick left them."""
     seen = readings(z.sensors.star, z.sensors.gyro, x)
-    # as `completed`, without its search for NaN, which these sensors do not say: 5 % of the run
+    # as `completed`, without its search for NaN, which these sensors never give
     y = AttitudeRate(*(where(told.valid, a, b) for told, a, b in zip(z.sensors.y, seen, x.estimate)))
     u = command(params, z.k_w, y)
     return X(

@@ -76,9 +76,7 @@ class Scenario(NamedTuple):
     noise: Annotated[Any, "deg", finite, not_negative] = 0.05  # of the attitude per sample: half-width, std if Gaussian
     uniform: Annotated[Any, "1", flag] = 1.0  # 1: the attitude noise is uniform; 0: Gaussian
     delay: Annotated[Any, "s", not_negative] = 0.0  # age of the attitude readings, at most `DELAYS` ticks
-    tacho_noise: Annotated[Any, "deg/s", finite, not_negative] = (
-        0.0  # std of the wheel-speed noise per sample, one a tick
-    )
+    tacho_noise: Annotated[Any, "deg/s", finite, not_negative] = 0.0  # std of the wheel-speed noise per sample
     tacho_step: Annotated[Any, "deg/s", finite, not_negative] = 0.0  # quantisation of the wheel speed; 0 for none
     momentum: Annotated[Any, "kg m^2 deg/s", finite] = 0.0  # total at the start, which eq. (1) takes as zero
     torque: Annotated[Any, "N m", finite] = 0.0  # disturbance
