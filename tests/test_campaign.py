@@ -146,7 +146,8 @@ if __name__ == "__main__":
 
 
 def test_two_devices_give_the_same_bits(whole, tmp_path):
-    env = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "PYTHONPATH": str(ROOT)}
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2"
+    env = os.environ | {"XLA_FLAGS": flags, "PYTHONPATH": str(ROOT)}
     subprocess.run([sys.executable, "-c", DEVICES, tmp_path / "two.zarr", str(BLOCKS // 2)], env=env, check=True)
     assert same_data(dataset(tmp_path / "two.zarr"), dataset(whole))
 

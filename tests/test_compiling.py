@@ -153,7 +153,7 @@ NEEDS_FLAGS = jax.__version_info__ < (0, 12)
 def test_a_second_process_takes_its_programs_from_the_cache_and_gets_the_same_bits(tmp_path):
     first, second = (process("told() | ran()", tmp_path) for _ in range(2))
     assert first["misses"] > 0 and first["hits"] == 0
-    assert second["hits"] > 0 and second["misses"] < first["misses"] / 2
+    assert second["hits"] >= first["misses"]  # every program that the first stored
     assert second["bits"] == first["bits"]
     folder = Path(first["folder"])
     assert folder.parent == tmp_path / "jaxatt" and f"jax-{jax.__version__}-" in folder.name and any(folder.iterdir())

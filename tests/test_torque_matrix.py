@@ -180,21 +180,30 @@ def test_the_pseudo_inverse_does_not_depend_on_the_unit():
         np.testing.assert_allclose(solved(size * T, size * a, 0.0), solved(T, a, 0.0), rtol=2e-5, atol=1e-5)
 
 
+def along(s, factors):
+    """P (4, 3) of T = (L + s L') (R + s R'), whose rank does not change with s."""
+    left, dleft, right, dright = factors
+    return array(pseudo_inverse(Vec3.of((left + s * dleft) @ (right + s * dright)), 1e-12)).T
+
+
+SLOPES = jax.jit(lambda factors: (along(0.0, factors), *(d(along)(0.0, factors) for d in (jax.jacfwd, jax.jacrev))))
+BEND = jax.jit(jax.jacfwd(jax.jacrev(along)))
+
+
 @pytest.mark.parametrize("rank", [3, 2, 1, 0])
 def test_the_derivative_of_the_pseudo_inverse_is_exact_at_constant_rank(rank):
     """Along a direction that keeps the rank, against a central difference of NumPy's; twice differentiable too."""
     rng = np.random.default_rng(rank)
-    left, right = rng.normal(size=(2, 3, rank)), rng.normal(size=(2, rank, 4))
-    T = lambda s: (left[0] + s * left[1]) @ (right[0] + s * right[1])
-    plain = lambda s: np.linalg.pinv(T(s), rcond=1e-9)
-    ours = lambda s: array(pseudo_inverse(Vec3.of(T(s)), 1e-12)).T
-    np.testing.assert_allclose(ours(0.0), plain(0.0), atol=1e-11)
+    used = np.arange(3) < rank
+    left, right = rng.normal(size=(2, 3, 3)) * used, rng.normal(size=(2, 3, 4)) * used[:, None]
+    plain = lambda s: np.linalg.pinv((left[0] + s * left[1]) @ (right[0] + s * right[1]), rcond=1e-9)
+    value, slope, back = SLOPES((*left, *right))
+    np.testing.assert_allclose(value, plain(0.0), atol=1e-11)
     h = 1e-5
-    slope = jax.jacfwd(ours)(0.0)
     np.testing.assert_allclose(slope, (plain(h) - plain(-h)) / (2 * h), rtol=1e-6, atol=1e-6)
-    np.testing.assert_allclose(jax.jacrev(ours)(0.0), slope, atol=1e-10)
+    np.testing.assert_allclose(back, slope, atol=1e-10)
     bend = (plain(10 * h) - 2 * plain(0.0) + plain(-10 * h)) / (10 * h) ** 2
-    np.testing.assert_allclose(jax.jacfwd(jax.jacrev(ours))(0.0), bend, rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(BEND(0.0, (*left, *right)), bend, rtol=1e-3, atol=1e-3)
 
 
 def test_gradients_of_the_pseudo_inverse_are_finite_at_every_rank():

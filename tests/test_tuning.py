@@ -252,7 +252,8 @@ def swept(theta, key):
 
 
 def test_draws_are_shared_by_devices_and_average_the_cost(tmp_path):
-    env = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "PYTHONPATH": str(ROOT)}
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2"
+    env = os.environ | {"XLA_FLAGS": flags, "PYTHONPATH": str(ROOT)}
     subprocess.run([sys.executable, "-c", TWO_DEVICES, tmp_path / "two.npz"], env=env, cwd=ROOT, check=True)
     two = np.load(tmp_path / "two.npz")
     best, history = shared_search()
