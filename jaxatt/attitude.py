@@ -203,9 +203,13 @@ def nearest_rotation(m: Mat3) -> Mat3:
     entries = jnp.broadcast_arrays(*(jnp.asarray(a, kind) for row in m for a in row))
     m = Mat3.of([entries[:3], entries[3:6], entries[6:]])
     m = m * jnp.sqrt(3 / (m.x @ m.x + m.y @ m.y + m.z @ m.z))
-    three = diagonal([jnp.full_like(entries[0], 3)] * 3)
-    m = jax.lax.fori_loop(0, 14, lambda _, m: (m @ (three - m.T @ m)) * 0.5, m)
+    m = jax.lax.fori_loop(0, 14, _newton_schulz, m)
     return where(det(m) > 0.999, m, jax.tree.map(lambda a: jnp.full_like(a, jnp.nan), m))
+
+
+def _newton_schulz(_, m: Mat3) -> Mat3:
+    """M (3 I - M' M) / 2; a function of the module, so that calls without jit compile the loop once."""
+    return (m @ (diagonal([jnp.full_like(m.x.x, 3)] * 3) - m.T @ m)) * 0.5
 
 
 def quat_from_vector(r: Vec3) -> Quat:

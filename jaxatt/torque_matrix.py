@@ -140,7 +140,7 @@ def pseudo_inverse(t: Vec3, rcond) -> Vec3:
     one, zero = jnp.ones_like(size), jnp.zeros_like(size)
     rows = tuple(row / size for row in t)
     turns = tuple(Vec3(*(one if i == k else zero for k in range(3))) for i in range(3))
-    rows, turns = jax.lax.fori_loop(0, SWEEPS, lambda _, state: _sweep(*state), (rows, turns))
+    rows, turns = jax.lax.fori_loop(0, SWEEPS, _sweep, (rows, turns))
     squares = [_sum(row * row) for row in rows]
     eps = len(t.x) * jnp.finfo(size.dtype).eps
     least = jnp.square(jnp.maximum(rcond, eps)) * reduce(jnp.maximum, squares)
@@ -171,9 +171,9 @@ def _combined(columns: Vec3, m: Mat3) -> Vec3:
     return Vec3(*(columns.x * c.x + columns.y * c.y + columns.z * c.z for c in m.T))
 
 
-def _sweep(rows, turns):
+def _sweep(_, state):
     """One rotation of each pair of rows that makes them orthogonal, and of U."""
-    rows, turns = list(rows), list(turns)
+    rows, turns = map(list, state)
     for i, j in combinations(range(3), 2):
         across, apart = 2 * _sum(rows[i] * rows[j]), _sum(rows[j] * rows[j]) - _sum(rows[i] * rows[i])
         divisor = jnp.abs(apart) + jnp.sqrt(apart * apart + across * across)
