@@ -187,9 +187,8 @@ def test_angles_that_wrap_at_180_deg_are_the_angles_that_do_not():
         case.decide, Spinning.params, run.start, run.told._replace(angle=jumping), dt=gyro_ekf.DT
     )
     close(run.computers.belief.mean, computers.belief.mean)
-    close(
-        run.log.filter.nis, met.nis, 1e-5
-    )  # momenta of 700 are rounded to 1e-9 of their noise, and a run adds these up
+    close(run.log.filter.nis[:12], met.nis[:12], 1e-6)
+    close(run.log.filter.nis, met.nis, 1e-5)  # so far do readings changed in their last place move it in this run, too
     assert met.nis[3:].max() < 60 and np.abs(run.log.filter.error[8:, gyro_ekf.ANGLE]).max() < 1e-3
 
 
