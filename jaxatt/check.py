@@ -25,7 +25,7 @@ from jax.core import Tracer
 
 def refuse(name: str, must: str, value) -> NoReturn:
     """Raise the ValueError "`name` must ..., but it is value."."""
-    raise ValueError(f"`{name}` must {must}, but it is {value}.")
+    raise ValueError(" ".join(f"`{name}` must {must}, but it is {value}.".splitlines()))
 
 
 def short(value) -> str:

@@ -197,7 +197,7 @@ def load(
         if not (value is None or isinstance(value, str)) or value not in allowed:
             check.refuse(name, f"be one of {allowed}", check.short(value))
     if separator == decimal:
-        check.refuse("separator", "not be the decimal sign", repr(separator))
+        check.refuse("separator", "differ from `decimal`", repr(separator))
 
     def pick(header: list[str]) -> list[int]:
         at = time_column(path.name, header, separator, str(time), stamps)
@@ -262,15 +262,15 @@ def unit_quaternions(columns: Mapping[str, Any], names) -> dict[str, np.ndarray]
         The four channels by name, for ``columns | unit_quaternions(columns, names)``.
 
     Raises:
-        ValueError: names that are not four channels, no complete sample, a length of zero or more than 5 % off the median.
+        ValueError: names that are not four different channels, no complete sample, a length of zero or more than 5 % off the median.
     """
     check.mapping("columns", columns)
     names = list(names) if np.iterable(names) and not isinstance(names, str) else []
-    if len(names) != 4 or not all(name in list(columns) for name in names):
-        check.refuse("names", f"be four channels ({', '.join(map(str, columns))})", check.short(names))
+    if len(names) != 4 or not all(name in list(columns) and names.count(name) == 1 for name in names):
+        check.refuse("names", f"be four different channels ({', '.join(map(str, columns))})", check.short(names))
     parts = [np.asarray(check.real(str(name), columns[name]), float) for name in names]
     if len({part.shape for part in parts}) > 1 or parts[0].ndim != 1:
-        check.refuse("names", "be four channels of one shape (T,)", f"of shapes {[part.shape for part in parts]}")
+        check.refuse("names", "be channels of one shape (T,)", f"of shapes {[part.shape for part in parts]}")
     q = np.stack(parts)
     known = np.isfinite(q).all(axis=0)
     length = np.sqrt(np.sum(q**2, axis=0))

@@ -299,6 +299,18 @@ def test_damage_is_never_read_and_is_repaired(whole, tmp_path, damage, chunk):
     assert tiny.files(path) == tiny.files(whole)
 
 
+def test_damaged_times_are_never_read_and_are_repaired(tmp_path):
+    recorded, path = tiny.campaign(record=tiny.record, every=10), tmp_path / "x.zarr"
+    run(path, recorded, 200)
+    before = tiny.files(path)
+    for damage in (halved, flipped, emptied, Path.unlink):
+        damage(path / "time/c/0")
+        with pytest.raises(RuntimeError, match="the times of its records are damaged"):
+            dataset(path)
+        run(path, recorded, 200)
+        assert tiny.files(path) == before
+
+
 def test_a_full_disk_is_reported_and_what_is_done_is_kept(whole, tmp_path):
     place = tmp_path / "small"
     place.mkdir()

@@ -247,6 +247,16 @@ def test_an_impossible_covariance_never_looks_like_a_perfect_fit(scalar, P, R):
         np.testing.assert_array_equal(b.cov, P * np.eye(2))
 
 
+def test_a_likelihood_over_the_variance_has_its_least_value_at_the_truth_and_none_below_zero():
+    """Residuals of x = 0 known for certain, of variance 0.5: the best R is their mean square, and R < 0 is never better."""
+    y = np.sqrt(0.5) * np.random.default_rng(0).normal(size=400)
+    grid = np.linspace(-2, 2, 401)
+    one = lambda R, y: update(Belief(jnp.zeros(1), jnp.zeros((1, 1))), seen(y[None]), lambda x: x, R[None])[1].nll
+    total = np.asarray(jax.jit(jax.vmap(lambda R: jnp.sum(jax.vmap(partial(one, R))(y))))(grid))
+    assert np.isnan(total[grid < -1e-9]).all()
+    assert grid[np.nanargmin(total)] == pytest.approx(np.mean(y**2), abs=0.01)
+
+
 def test_what_is_missing_may_have_any_variance(updated):
     y = Reading(np.ones(4), np.array([True, False, True, False]))
     _, told = updated(START, y, np.array([0.1, -1.0, 0.3, NAN]))

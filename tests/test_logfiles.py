@@ -63,7 +63,7 @@ REFUSED = {
                                           r"`g \[rad/s\]` must hold numbers \(pass decimal=',' .*'0,5' in row 0"),
     "decimal points where commas are asked for": ("time [s];g [rad/s]\n0;1.234,5\n", dict(separator=";", decimal=","),
                                                   r"`g \[rad/s\]` must hold numbers, but it is '1.234,5'"),
-    "commas for both": (HEAD, dict(decimal=","), "`separator` must not be the decimal sign"),
+    "commas for both": (HEAD, dict(decimal=","), "`separator` must differ from `decimal`"),
     "thousands": (HEAD + '0,"1,234.5"\n', {}, "must hold numbers, but it is '1,234.5' in row 0"),
     "underscores": (HEAD + "0,1_000\n", {}, "must hold numbers, but it is '1_000' in row 0"),
     "another script's digits": (HEAD + "0,٣\n", {}, "must hold numbers"),

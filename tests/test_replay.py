@@ -431,13 +431,14 @@ def test_the_order_of_the_names_says_where_the_scalar_is():
 @pytest.mark.parametrize(
     ("change", "names", "message"),
     [
-        ({}, ["w", "x", "y"], "`names` must be four channels"),
-        ({}, "wxyz", "`names` must be four channels"),
-        ({}, ["w", "x", "y", "q"], "`names` must be four channels"),
+        ({}, ["w", "x", "y"], "`names` must be four different channels"),
+        ({}, "wxyz", "`names` must be four different channels"),
+        ({}, ["w", "x", "y", "q"], "`names` must be four different channels"),
+        ({}, ["w", "x", "y", "y"], "`names` must be four different channels"),
         (dict(w=np.zeros(40), x=np.zeros(40), y=np.zeros(40), z=np.zeros(40)), list("wxyz"), "of length 0 in row 0"),
         (dict(w=np.linspace(0, 3, 40)), list("wxyz"), r"`w` must belong to quaternions of one length .* in row \d+"),
         (dict(w=np.full(40, np.nan)), list("wxyz"), "`w` must belong to one complete quaternion at least"),
-        (dict(w=np.ones(3)), list("wxyz"), "`names` must be four channels of one shape"),
+        (dict(w=np.ones(3)), list("wxyz"), "`names` must be channels of one shape"),
     ],
 )
 def test_what_is_no_quaternion_is_refused(change, names, message):

@@ -14,7 +14,7 @@ import xarray as xr
 from jaxatt import check
 from jaxatt.campaign.draw import Campaign, checked, drawn
 from jaxatt.campaign.provenance import manifest_of, names_of, refuse_other
-from jaxatt.campaign.store import OWN, blocks_of, open_store, readable, state_of
+from jaxatt.campaign.store import OWN, blocks_of, open_store, readable, state_of, stored_times
 from jaxatt.engine import prepared
 from jaxatt.noise import BLOCK
 from jaxatt.sweeping import block_of, logged
@@ -52,6 +52,11 @@ def dataset(path) -> xr.Dataset:
     if damaged:
         raise RuntimeError(
             f"`path` must be whole, but blocks {damaged} are damaged in {store.path}: run the campaign again to repair them."
+        )
+    recorded = {a.shape[0] for a in store.arrays.values() if "time" in (a.metadata.dimension_names or ())}
+    if recorded - {len(stored_times(store))}:
+        raise RuntimeError(
+            f"`path` must be whole, but the times of its records are damaged in {store.path}: run the campaign again to repair them."
         )
     with readable(store.path):
         opened = xr.open_zarr(store.path, consolidated=False, chunks=None, zarr_format=3)

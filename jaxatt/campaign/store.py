@@ -26,6 +26,7 @@ from zarr.codecs import Crc32cCodec, ZstdCodec
 
 STATUS = ("good", "failed", "refused")  # of a scenario: its score `ok` held; it did not; the system's check refused it
 OWN = "done"  # the array of checksums
+_CODECS: Any = [ZstdCodec(level=1), Crc32cCodec()]
 _WHOLE = {"array.write_empty_chunks": True}  # a missing file shall mean a missing block; read as arrays are opened
 
 
@@ -71,27 +72,47 @@ def create(path: Path, variables: Mapping[str, Variable], manifest: Mapping, tim
         group = zarr.create_group(
             new, zarr_format=3, attributes={"campaign": "", "arrays": json.dumps(list(variables))}
         )
-        codecs: list = [ZstdCodec(level=1), Crc32cCodec()]
         for name, v in variables.items():
             flags = {"flag_values": [0, 1, 2], "flag_meanings": " ".join(STATUS)} if v.role == "status" else {}
             unit = {"units": v.units} if v.units else {}
             nothing: Any = {"f": np.nan, "i": -1}.get(v.dtype.kind, 0)
             group.create_array(
                 name, shape=(*v.shape, n), chunks=(*(max(a, 1) for a in v.shape), block), dtype=v.dtype,
-                compressors=codecs, fill_value=nothing, dimension_names=v.dims, attributes={"role": v.role, **flags, **unit},
+                compressors=_CODECS, fill_value=nothing, dimension_names=v.dims, attributes={"role": v.role, **flags, **unit},
             )  # fmt: skip
         group.create_array(
-            OWN, shape=(blocks_of(n, block),), chunks=(1,), dtype=np.uint64, fill_value=0, compressors=codecs,
+            OWN, shape=(blocks_of(n, block),), chunks=(1,), dtype=np.uint64, fill_value=0, compressors=_CODECS,
             dimension_names=("block",), attributes={"role": "checksum", "long_name": "2^32 + crc32 of a block"},
         )  # fmt: skip
         if times is not None:
-            array = group.create_array(
-                "time", shape=times.shape, dtype=times.dtype, dimension_names=("time",),
-                attributes={"role": "time", "units": "s"},
-            )  # fmt: skip
-            array[:] = times
+            _write_times(group, times)
     _describe(new, manifest)
     os.rename(new, path)
+
+
+def _write_times(group, times: np.ndarray) -> None:
+    array = group.create_array(
+        "time", shape=times.shape, dtype=times.dtype, dimension_names=("time",), attributes={"role": "time", "units": "s"},
+        compressors=_CODECS, fill_value=np.nan, overwrite=True,
+    )  # fmt: skip
+    array[:] = times
+
+
+def repair_times(store: Store, times: np.ndarray) -> None:
+    """Write the times [s] of the records anew, where the store holds others or none."""
+    if not np.array_equal(stored_times(store), times):
+        with zarr.config.set(_WHOLE):
+            _write_times(zarr.open_group(store.path, mode="r+", zarr_format=3, use_consolidated=False), times)
+
+
+def stored_times(store: Store) -> np.ndarray:
+    """Times [s] of the records; none where they are gone or damaged."""
+    try:
+        group: Any = zarr.open_group(store.path, mode="r", zarr_format=3, use_consolidated=False)
+        times = np.asarray(group["time"][:], float)
+        return times[np.isfinite(times)]
+    except Exception:  # whatever Zarr says of it
+        return np.zeros(0)
 
 
 _BESIDE = "zarr.json.partial"

@@ -28,6 +28,7 @@ from jaxatt.campaign.store import (
     metadata_lock,
     open_store,
     read_block,
+    repair_times,
     sized,
     state_of,
     sweep_up,
@@ -136,15 +137,19 @@ def _refuse_fork(executor) -> None:
 
 def _prepared(path: Path, campaign: Campaign, n: int, grow: bool, accept) -> Store:
     """The store, created if there is none, for n scenarios."""
-    if not path.exists():
+    times = None
+    if campaign.record is not None:
         times = time_of(np.arange(0, campaign.ticks, campaign.every), campaign.system.dt, np.float64)
-        create(path, variables(campaign), manifest_of(campaign, n), None if campaign.record is None else times)
+    if not path.exists():
+        create(path, variables(campaign), manifest_of(campaign, n), times)
         return open_store(path, "r+")
     store = open_store(path, "r+")
     refuse_other(path, store.manifest, manifest_of(campaign, n), accept)
     stored = store.manifest["n"]
     if n < stored or (n > stored and not grow):
         check.refuse("n", f"be the {stored} scenarios of the store (or more, in `extend`)", n)
+    if times is not None:
+        repair_times(store, times)
     return sized(store, n)
 
 
