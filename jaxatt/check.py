@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jax.dtypes import prng_key
 
 
 def refuse(name: str, must: str, value) -> NoReturn:
@@ -82,6 +83,11 @@ def _place_of(name: str, index: tuple, shape: tuple) -> tuple[str, str]:
     return (f"[{', '.join(map(str, index))}]" if index else ""), where
 
 
+def is_key(value) -> bool:
+    """Whether the value is a typed key of JAX's random numbers, which is an array and holds no numbers."""
+    return hasattr(value, "dtype") and jnp.issubdtype(value.dtype, prng_key)
+
+
 def real(name: str, value) -> np.ndarray:
     """The value as an array; refuses, with TypeError, what holds no real numbers."""
     try:
@@ -99,6 +105,13 @@ def number(name: str, value) -> float:
     if a.shape != ():
         refuse(name, "be one number", short(value))
     return float(a)
+
+
+def fits(name: str, value, other: str, against) -> None:
+    """Refuse what does not broadcast with the other value."""
+    shape, there = np.shape(value), np.shape(against)
+    if any(1 != m != n != 1 for m, n in zip(shape[::-1], there[::-1])):
+        refuse(name, f"have a shape that fits that of `{other}`, {there}", f"of shape {shape}")
 
 
 def positive(name: str, value) -> None:

@@ -79,7 +79,7 @@ def at_tick(instant, dt: float):
     if not jnp.issubdtype(instant.dtype, jnp.floating):
         return instant
     xp = np if check.concrete(instant) else jnp
-    dtype = instant.dtype
+    instant, dtype = xp.asarray(instant), instant.dtype  # within jit even a concrete array of JAX would be traced
     here = jax.lax.stop_gradient(instant) if xp is jnp else instant
     countable = (here > -dt) & (here < 2.147e9 * dt)
     here = xp.where(countable, here, xp.zeros((), dtype))

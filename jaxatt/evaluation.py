@@ -115,7 +115,8 @@ def chance(false_alarm, samples):
     """
     check.share("false_alarm", false_alarm)
     check.not_negative("samples", samples)
-    return -jnp.expm1(samples * jnp.log1p(-jnp.asarray(false_alarm, float)))
+    check.fits("samples", samples, "false_alarm", false_alarm)
+    return -jnp.expm1(jnp.asarray(samples, float) * jnp.log1p(-jnp.asarray(false_alarm, float)))
 
 
 def interval(successes: int, trials: int, level: float = 0.95) -> tuple[float, float]:

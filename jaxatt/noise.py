@@ -11,7 +11,6 @@ from math import prod
 
 import jax
 import jax.numpy as jnp
-from jax.dtypes import prng_key
 from jax.extend.random import threefry_2x32
 
 from jaxatt import check
@@ -63,7 +62,7 @@ def chunk_noise(system: System, key, k0, ticks: int, lanes: tuple, dtype):
 
 def one_key(key):
     """The two raw words of a single key, typed or raw; TypeError for what is no key, ValueError for several."""
-    if hasattr(key, "dtype") and jnp.issubdtype(key.dtype, prng_key):
+    if check.is_key(key):
         if str(jax.random.key_impl(key)) != "threefry2x32":
             raise TypeError(
                 f"`key` must be a threefry key, jax.random.key(seed), but it is one of {jax.random.key_impl(key)}."

@@ -44,9 +44,10 @@ def column(data, name: str) -> np.ndarray:
     Raises ValueError where there is none of that name.
     """
     there = _names(data)
-    if name not in there:
-        check.refuse("name", "be one of " + ", ".join(map(str, there)), repr(name))
-    return np.asarray(getattr(data, name) if hasattr(data, "_fields") else data[name])
+    if not isinstance(name, str) or name not in there:
+        check.refuse("name", "be one of " + ", ".join(map(str, there)), check.short(name))
+    values = getattr(data, name) if hasattr(data, "_fields") else data[name]
+    return np.asarray(values) if not check.is_key(values) else check.real(f"data[{name!r}]", values)
 
 
 def _names(data) -> list:
@@ -55,9 +56,9 @@ def _names(data) -> list:
     return list(data._fields) if hasattr(data, "_fields") else list(data)
 
 
-def _numbers(data, name: str) -> np.ndarray:
+def _numbers(data, name: str, n: int | None = None) -> np.ndarray:
     """A column of shape (n,) as floats."""
-    return _series(f"data[{name!r}]", column(data, name))
+    return _series(f"data[{name!r}]", column(data, name), n)
 
 
 def _series(name: str, values, n: int | None = None) -> np.ndarray:
@@ -241,8 +242,9 @@ def heat_map(
     check.fits_memory(f"`bins` = {bins}", 100 * bins**2, "take fewer")
     ax = _new(ax, figsize=(5.6, 4.2))
     edges, places = [], []
+    z = _numbers(data, value)
     for name in (x, y):
-        a = _numbers(data, name)
+        a = _numbers(data, name, len(z))
         if name in log:
             check.positive(f"data[{name!r}]", a)
         check.finite(f"data[{name!r}]", a)
@@ -252,7 +254,6 @@ def heat_map(
         edge = np.linspace(low, high if high > low else low + 1, bins + 1)
         places.append(np.clip(np.searchsorted(edge, a, side="right") - 1, 0, bins - 1))
         edges.append(np.exp(edge) if name in log else edge)
-    z = _numbers(data, value)
     known = np.isfinite(z)
     where = places[1][known] * bins + places[0][known]
     total = np.bincount(where, z[known], bins * bins)
@@ -364,7 +365,7 @@ def pareto(
     data: columns of shape (n,); x and y name two of them. marked: names of designs, by their number, such as ``{"paper": 0}``.
     """
     first = _numbers(data, x)
-    costs = np.stack([first, _series(f"data[{y!r}]", column(data, y), len(first))], axis=1)
+    costs = np.stack([first, _numbers(data, y, len(first))], axis=1)
     for name, number in _mapping("marked", marked).items():
         if check.whole(f"marked[{name!r}]", number, 0) >= len(costs):
             check.refuse(f"marked[{name!r}]", f"be less than the {len(costs)} designs", number)
@@ -406,6 +407,8 @@ def subsets(
     axes = np.ravel(axes)
     for ax, (label, series) in zip(axes, values.items()):
         several = series if isinstance(series, Mapping) else {"": series}
+        if not several:
+            check.refuse(f"values[{label!r}]", "hold one series at least", "empty")
         width = 0.8 / len(several)
         for i, (name, heights) in enumerate(several.items()):
             heights = _series(f"values[{label!r}]", heights, len(out))

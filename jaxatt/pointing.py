@@ -251,7 +251,7 @@ def _samples(name: str, time, dt, least: int) -> int:
 def _numbers(name: str, values):
     """The values as floating numbers, and the library whose they are."""
     if isinstance(values, jax.Array):
-        if values.dtype.kind not in "biuf":
+        if check.is_key(values) or values.dtype.kind not in "biuf":
             check.real(name, values)
         return values.astype(jnp.result_type(values, 1.0)), jnp
     values = check.real(name, values)

@@ -312,9 +312,13 @@ def norm(v):
 
 
 def safe_sqrt(a):
-    """Square root of a >= 0 whose gradient at zero is one, not infinite, so that the one of sqrt(v @ v) is zero."""
-    positive = a > 0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, a, 1)), a)
+    """Square root of a >= 0 whose gradient at zero is one, not infinite, so that the one of sqrt(v @ v) is zero.
+
+    The compiler may work a out twice, in one place a rounding above zero: whichever branches it takes, nothing large comes
+    of it. Below the least normal number the root is a itself.
+    """
+    least = jnp.finfo(jnp.result_type(float, a)).tiny
+    return jnp.where(a > least, jnp.sqrt(jnp.maximum(a, least)), a)
 
 
 def columns(axes) -> list[Vec3]:

@@ -122,6 +122,13 @@ def test_single_runs_and_traced_ones_start_at_the_same_ticks(real):
     assert slope == -40
 
 
+def test_instants_of_jax_that_are_known_are_known_within_jit():
+    """As where params are traced and the scenario, drawn before, is not."""
+    onsets = jnp.array([0.3 + 1e-8, np.inf, 0.77])
+    found = jax.jit(lambda a: a + at_tick(onsets, 0.1))(0.0)
+    np.testing.assert_array_equal(found, at_tick(np.asarray(onsets), 0.1))
+
+
 @pytest.mark.parametrize("k", [2**20, 2**22, 2**23 - 20])
 def test_float32_tells_the_ticks_of_eight_million_apart(k):
     dt, end = 0.005, k + 10

@@ -28,7 +28,6 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 import zarr
-from jax.dtypes import prng_key
 
 from jaxatt import check
 from jaxatt.campaign.draw import Campaign, named
@@ -108,8 +107,7 @@ def _name(thing, seen: tuple = ()) -> str:
         words = [name(a) for a in thing.args] + [f"{k}={name(v)}" for k, v in sorted(thing.keywords.items())]
         return f"{name(thing.func)}({', '.join(words)})"
     if isinstance(thing, (np.ndarray, np.generic, jax.Array)):
-        key = jnp.issubdtype(thing.dtype, prng_key)
-        return str(_plain(jax.random.key_data(jnp.asarray(thing)) if key else thing))
+        return str(_plain(jax.random.key_data(jnp.asarray(thing)) if check.is_key(thing) else thing))
     if isinstance(thing, Mapping):
         return f"{{{', '.join(f'{name(k)}: {name(v)}' for k, v in thing.items())}}}"
     if isinstance(thing, (tuple, list)):

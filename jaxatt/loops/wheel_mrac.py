@@ -277,7 +277,9 @@ def estimated(params: Params, now, computer: Computer, readings: Readings):
     """The estimate of a after eqs. (7)-(10), and whether it had to be kept from changing its sign."""
     turns, last, rates = computer.turns, computer.memory, params.differenced > 0
     theta = known(readings.theta, 0.0)
-    used = present(readings.theta) & (last.fresh | jnp.logical_not(rates))  # without a reading the estimator forgets and learns nothing
+    used = present(readings.theta) & (
+        last.fresh | jnp.logical_not(rates)
+    )  # without a reading the estimator forgets and learns nothing
     W = jnp.where(used, jnp.where(rates, (turns - last.turns) / now.dt, turns), 0)
     output = jnp.where(used, jnp.where(rates, (theta - last.theta) / now.dt, theta), 0)
     due = (params.ope > 0) & (now.k > 0)
