@@ -27,7 +27,7 @@ def shared(f: Callable, *operands):
     keeps them apart. This boundary is always taken, but the compiler does not know it.
     """
     traced_operands = [leaf for leaf in jax.tree.leaves(operands) if isinstance(leaf, Tracer)]
-    if not traced_operands:
+    if not traced_operands or jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
         return f(*operands)
     f = jax.jit(f, inline=True)  # traced once for its shapes and its values
     # tied to an operand, lest reverse mode on JAX 0.10 takes the branch apart before the operand is known
