@@ -3,6 +3,7 @@ import os
 
 import jax
 import matplotlib
+import pytest
 
 import jaxatt
 
@@ -21,3 +22,12 @@ jax.config.update("jax_traceback_filtering", "off")  # else JAX adds a line to e
 jaxatt.configure()  # workers and later runs share compiled programs
 matplotlib.use("Agg")
 gc.set_threshold(50_000, 20, 50)  # programs and traces are many objects that stay
+
+# XLA's optimisations take longer than they save where runs are short: the programs of these modules go without most of
+# them. All others, with long runs or with bits to compare, are compiled as a user's are.
+SHORT = {"test_attitude", "test_filters", "test_linear", "test_replay", "test_torque_matrix"}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def optimisations(request):
+    jax.config.update("jax_disable_most_optimizations", request.module.__name__ in SHORT)
