@@ -113,10 +113,13 @@ REACH = {
 
 @pytest.mark.parametrize("name", SKEWS)
 def test_reach_along_the_axes(name):
-    np.testing.assert_allclose(sg.reach(THREE[name], Vec3(*np.eye(3))), REACH[name][0], atol=1e-5)
-    np.testing.assert_allclose(sg.reach(FOUR[name], Vec3(*np.eye(3))), REACH[name][1], atol=1e-4)
-    d = sg.sphere(50)
-    assert (np.asarray(sg.reach(THREE[name], d)) <= np.asarray(sg.support(THREE[name], d)) + 1e-9).all()
+    d = Vec3(
+        *(np.append(a, b) for a, b in zip(np.eye(3), sg.sphere(96)))
+    )  # 99 directions, as many as `envelope` refines
+    for axes, along, atol in zip((THREE[name], FOUR[name]), REACH[name], (1e-5, 1e-4)):
+        reached = np.asarray(sg.reach(axes, d))
+        np.testing.assert_allclose(reached[:3], along, atol=atol)
+        assert (reached <= np.asarray(sg.support(axes, d)) + 1e-9).all()
 
 
 @pytest.mark.slow
