@@ -97,7 +97,7 @@ def test_every_loop_and_its_derivatives_are_traced_under_strict_checks(name, fla
     floats = lambda tree: [a for a in jax.tree.leaves(tree) if jnp.issubdtype(a.dtype, jnp.floating)]
 
     def cost(params, scenario):
-        log = simulate(loop.system, params, scenario, KEY, ticks=3)
+        log = simulate(loop.system, params, scenario, KEY, ticks=10)  # a whole chunk takes the least tracing
         return sum(jnp.mean(a * a).astype(float) for a in floats(log))
 
     def found(params, scenarios):
