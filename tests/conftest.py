@@ -25,7 +25,10 @@ gc.set_threshold(50_000, 20, 50)  # programs and traces are many objects that st
 
 # XLA's optimisations take longer than they save where runs are short: the programs of these modules go without most of
 # them. All others, with long runs or with bits to compare, are compiled as a user's are.
-SHORT = {"test_attitude", "test_filters", "test_linear", "test_replay", "test_torque_matrix"}
+SHORT = {
+    "test_attitude", "test_filters", "test_linear", "test_replay", "test_torque_matrix", "test_tuning_star_isolation",
+    "test_wheels",
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module", autouse=True)
