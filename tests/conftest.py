@@ -23,14 +23,16 @@ jaxatt.configure()  # workers and later runs share compiled programs
 matplotlib.use("Agg")
 gc.set_threshold(50_000, 20, 50)  # programs and traces are many objects that stay
 
-# XLA's optimisations take longer than they save where runs are short: the programs of these modules go without most of
-# them. All others, with long runs or with bits to compare, are compiled as a user's are.
+# XLA's optimisations take longer than they save where runs are short: the programs of these modules, and of tests marked
+# short, go without most of them. All others, with long runs or with bits to compare, are compiled as a user's are.
 SHORT = {
-    "test_attitude", "test_filters", "test_linear", "test_replay", "test_torque_matrix", "test_tuning_star_isolation",
-    "test_wheels",
+    "test_attitude", "test_detection", "test_engine", "test_filters", "test_flags", "test_linear", "test_replay",
+    "test_soft_scores", "test_torque_matrix", "test_tuning_star_isolation", "test_wheels",
 }  # fmt: skip
 
 
-@pytest.fixture(scope="module", autouse=True)
-def optimisations(request):
-    jax.config.update("jax_disable_most_optimizations", request.module.__name__ in SHORT)
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item):
+    """Before the fixtures, which compile too."""
+    short = item.module.__name__ in SHORT or item.get_closest_marker("short") is not None
+    jax.config.update("jax_disable_most_optimizations", short)

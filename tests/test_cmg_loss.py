@@ -169,6 +169,7 @@ def test_condition_of_figure_7(params, peak, at):
 # faults, seams, batches
 
 
+@pytest.mark.short
 @pytest.mark.slow
 def test_failures_of_table_1():
     start = (P, (45, 45, 45, 45))

@@ -156,6 +156,7 @@ def test_constant_faults_hide():
     assert log.xi[2500:].min() < 0.01
 
 
+@pytest.mark.short
 @pytest.mark.slow
 def test_gradients_are_finite_at_rest():
     scenario = QUIET._replace(q=zeros(), w=zeros(), q_hat=zeros(), w_hat=zeros())

@@ -320,6 +320,7 @@ def wheel_adaptation(theta, key):
     return jnp.mean(log.error**2) + 1e-8 * jnp.mean(log.step**2)
 
 
+@pytest.mark.short
 @pytest.mark.parametrize(
     ("cost", "names"),
     [
