@@ -289,7 +289,7 @@ def left_jacobian_inverse(r: Vec3) -> Mat3:
 def _small(tt):
     """Whether |r| is so small that a series is exact to rounding, and |r| where it is not."""
     small = tt < 1e-4
-    return small, jnp.sqrt(jnp.maximum(tt, 1e-4))  # a root of 1 would be wrong where tt is worked out twice
+    return small, jnp.sqrt(jnp.where(small, 1e-4, tt))  # a root of 1 would be wrong where tt is worked out twice
 
 
 def _about(r: Vec3, a, b) -> Mat3:
