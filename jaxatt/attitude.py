@@ -164,12 +164,17 @@ def quat_matrix(p: Quat) -> Mat3:
 
 
 def quat_from_matrix(m: Mat3) -> Quat:
-    """Unit quaternion, w >= 0, of the rotation nearest to m.
+    """Unit quaternion, w >= 0, of the rotation nearest to m; raises what `nearest_rotation` raises."""
+    return quat_from_rotation(nearest_rotation(m))
+
+
+def quat_from_rotation(m: Mat3) -> Quat:
+    """Unit quaternion, w >= 0, of a matrix that is a rotation to rounding, such as one of axes; nothing is checked.
 
     4 q q' has the elements of the matrix; its longest row keeps all digits at every angle (Shepperd, 1978; Markley,
-    2008). Raises what `nearest_rotation` raises.
+    2008).
     """
-    a, b, c = nearest_rotation(m)
+    a, b, c = m
     w, x, y, z = c.y - b.z, a.z - c.x, b.x - a.y, 1 + a.x + b.y + c.z
     xy, xz, yz = a.y + b.x, a.z + c.x, b.z + c.y
     rows = (

@@ -2,7 +2,7 @@
 
 The scenarios of a block lie side by side in the last axis, the lanes.
 
-May import: check, compiling, contract.
+May import: check, compiling, contract, vec.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from jax.extend.random import threefry_2x32
 from jaxatt import check
 from jaxatt.compiling import compiled, shared
 from jaxatt.contract import System
+from jaxatt.vec import polynomial
 
 BLOCK = 128  # scenarios that run side by side; with the key it fixes a scenario's noise, so it is no option
 CHUNK = 10  # ticks whose noise is drawn together, and between which reverse mode keeps the state
@@ -29,18 +30,11 @@ _Q = (1.0, 0.08329848156363834, 0.03219616729462598, 0.001858744245195428, 1.809
       1.3188746002534835e-06)  # fmt: skip
 
 
-def _polynomial(coefficients, w):
-    value = coefficients[-1]
-    for c in coefficients[-2::-1]:
-        value = value * w + c
-    return value
-
-
 def _normal(bits):
     """Standard normal numbers of random 32-bit words, float32, by the inverse distribution."""
     u = ((bits >> 9).astype(jnp.float32) + 0.5) * 2.0**-23  # symmetric, never 0 or 1
     w = -jnp.log(4 * u * (1 - u))
-    return (2 * u - 1) * _polynomial(_P, w) / _polynomial(_Q, w)
+    return (2 * u - 1) * polynomial(_P, w) / polynomial(_Q, w)
 
 
 def _words(key, shape):

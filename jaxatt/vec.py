@@ -216,9 +216,25 @@ def diagonal(d) -> Mat3:
     return Mat3(Vec3(x, o, o), Vec3(o, y, o), Vec3(o, o, z))
 
 
+def scaled_identity(s=1.0) -> Mat3:
+    """s I."""
+    return diagonal((s, s, s))
+
+
 def cross(a: Vec3, b: Vec3) -> Vec3:
     """Vector product a x b."""
     return Vec3(a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x)
+
+
+def skew(v: Vec3) -> Mat3:
+    """The matrix [v x] of the vector product, [v x] a = v x a."""
+    o = jnp.zeros_like(v.x)
+    return Mat3(Vec3(o, -v.z, v.y), Vec3(v.z, o, -v.x), Vec3(-v.y, v.x, o))
+
+
+def outer(a: Vec3, b: Vec3) -> Mat3:
+    """The dyadic product a b'."""
+    return Mat3(a.x * b, a.y * b, a.z * b)
 
 
 def det(m: Mat3):
@@ -242,17 +258,13 @@ _THIRD = np.polynomial.chebyshev.cheb2poly(
 
 def _cos_third(r):
     """cos(acos(r) / 3) for r in [-1, 1]."""
-    x = 2 * safe_sqrt((1 + r) / 2) - 1
-    value = float(_THIRD[-1])
-    for c in _THIRD[-2::-1]:
-        value = value * x + float(c)
-    return value
+    return polynomial(_THIRD, 2 * safe_sqrt((1 + r) / 2) - 1)
 
 
 def largest_eigenvalue(m: Mat3):
     """Largest eigenvalue of a symmetric matrix, in closed form; the gradient is finite where eigenvalues coincide."""
     mean = (m.x.x + m.y.y + m.z.z) / 3
-    a = m - diagonal((mean, mean, mean))
+    a = m - scaled_identity(mean)
     p = safe_sqrt((a.x @ a.x + a.y @ a.y + a.z @ a.z) / 6)
     a = a / jnp.where(p > 0, p, 1)  # before the determinant, where p^3 would underflow in float32
     return mean + 2 * p * _cos_third(jnp.clip(det(a) / 2, -1, 1))
@@ -319,6 +331,14 @@ def safe_sqrt(a):
     """
     least = jnp.finfo(jnp.result_type(float, a)).tiny
     return jnp.where(a > least, jnp.sqrt(jnp.maximum(a, least)), a)
+
+
+def polynomial(coefficients, x):
+    """Sum of coefficients[k] x^k, by Horner's scheme in the type of x."""
+    value = float(coefficients[-1])
+    for c in coefficients[-2::-1]:
+        value = value * x + float(c)
+    return value
 
 
 def columns(axes) -> list[Vec3]:

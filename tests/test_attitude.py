@@ -37,6 +37,7 @@ from jaxatt.attitude import (
     quat_from_euler,
     quat_from_matrix,
     quat_from_mrp,
+    quat_from_rotation,
     quat_from_scalar_last,
     quat_from_vector,
     quat_matrix,
@@ -86,6 +87,7 @@ COORDINATES = {
     "Euler angles": (euler_from_quat, quat_from_euler),
     "rotation vector": (vector_from_quat, quat_from_vector),
     "matrix": (quat_matrix, quat_from_matrix),
+    "axes": (quat_matrix, quat_from_rotation),
     "MRP of a matrix": (lambda p: mrp_from_matrix(quat_matrix(p)), quat_from_mrp),
     "Euler angles of a matrix": (lambda p: euler_from_matrix(quat_matrix(p)), quat_from_euler),
 } | {

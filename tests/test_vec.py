@@ -33,7 +33,8 @@ def test_vectors_and_matrices_agree_with_numpy(batch):
         (A + B, a + b), (A - B, a - b), (-A, -a), (2 * A, 2 * a), (A * 2, 2 * a), (A / 2, a / 2),
         (cross(A, B), np.cross(a, b, axis=0)), (M @ A, np.einsum("ij...,j...->i...", m, a)),
         (M @ N, np.einsum("ij...,jk...->ik...", m, n)), (M.T, np.swapaxes(m, 0, 1)), (M + N, m + n), (M - N, m - n),
-        (-M, -m), (3 * M, 3 * m), (M * 3, 3 * m), (M / 3, m / 3),
+        (-M, -m), (3 * M, 3 * m), (M * 3, 3 * m), (M / 3, m / 3), (vec.outer(A, B), np.einsum("i...,j...->ij...", a, b)),
+        (vec.skew(A) @ B, np.cross(a, b, axis=0)), (vec.scaled_identity(a[0]) @ B, a[0] * b),
     ]:  # fmt: skip
         np.testing.assert_allclose(array(ours), plain, rtol=1e-14, atol=1e-14)
         assert type(ours) is (Mat3 if plain.ndim == 2 + len(batch) else Vec3)
