@@ -1,8 +1,9 @@
-"""Delays: a line of the latest samples, and the sample of a given age in it.
+"""Delays: a line of the latest samples, and the sample of a given age in it; sensors that read now and then.
 
-The line is held between ticks, an array (k,) with the newest sample first; its length bounds the age.
+The line is held between ticks, an array (k,) with the newest sample first, or a tree of such arrays; its length bounds
+the age.
 
-May import: nothing of ours.
+May import: check.
 """
 
 from __future__ import annotations
@@ -10,10 +11,15 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
+from jaxatt import check
+
 
 def pushed(line, newest):
-    """The line (k,) one tick later: ``newest`` comes first, the oldest sample drops out."""
-    return jnp.concatenate([jnp.asarray(newest, line.dtype)[None], line[:-1]])
+    """The line (k,) one tick later: ``newest`` comes first, the oldest sample drops out.
+
+    Both may be trees of one structure, such as a `jaxatt.faults.Reading` with its flag.
+    """
+    return jax.tree.map(lambda a, new: jnp.concatenate([jnp.asarray(new, a.dtype)[None], a[:-1]]), line, newest)
 
 
 def delayed(line, age):
@@ -33,3 +39,30 @@ def delayed(line, age):
     newer, older = (jnp.sum(jnp.where(number == at, line, 0)) for at in (first, jnp.minimum(first + 1, last)))
     older = jnp.where((held > first) | jnp.isfinite(older), older, newer)
     return (1 - (age - first)) * newer + (age - first) * older
+
+
+# readings that come late or seldom
+
+
+def empty_line(reading, k: int):
+    """A line of k readings like this reading, any tree of numbers and flags: zeros, and no flag is up."""
+    return jax.tree.map(lambda a: jnp.zeros((k, *jnp.shape(a)), jnp.asarray(a).dtype), reading)
+
+
+def aged(line, age):
+    """The reading that is ``age`` [ticks] old, to the nearest tick; an age outside the line gives its newest or oldest.
+
+    Flags and quaternions, which `delayed` could not blend, come as they were.
+    """
+    i = jnp.clip(jnp.round(age), 0, jax.tree.leaves(line)[0].shape[0] - 1).astype(int)
+    return jax.tree.map(lambda a: a[i], line)
+
+
+def due(k, p: int, q: int):
+    """Whether a sensor that reads p times in q ticks reads at tick k; as even as ticks allow, the first at tick 0.
+
+    4 Hz in ticks of 10 Hz: p, q = 2, 5 gives ticks 0, 3, 5, 8, 10, ... Raises ValueError for p < 1 or p > q.
+    """
+    p = check.whole("p", p)
+    q = check.whole("q", q, p)
+    return (p * (k % q)) % q < p
