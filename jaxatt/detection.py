@@ -3,16 +3,19 @@
 An evaluation is any number that is large when something is wrong; here mostly J = r' M^-1 r, chi-square with as many
 degrees of freedom as the residual has where the filter is consistent. How good a detector is: `jaxatt.evaluation`.
 
-May import: check.
+May import: check, delays.
 """
 
 from __future__ import annotations
+
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax.scipy.special import gammaincc
 
 from jaxatt import check
+from jaxatt.delays import pushed
 
 NONE, FIRST, SECOND, COMMON = 0, 1, 2, 3  # causes that two residual generators can tell apart
 CAUSES = ("none", "first sensor", "second sensor", "common to both")
@@ -125,3 +128,61 @@ def worst_above(statistic, threshold):
     """Which of n channels, at most one, has the largest statistic and that above the threshold: bool (n,); NaN is above."""
     worst = jax.nn.one_hot(jnp.argmax(statistic, axis=0), len(statistic), dtype=bool, axis=0)
     return worst & alarm(jnp.max(statistic, axis=0), threshold)
+
+
+# sequential detectors: (state, value, tuning) -> state, statistic; a value that is missing is not fed
+
+
+class Cusum(NamedTuple):
+    """State of a two-sided CUSUM."""
+
+    up: Any = 0.0  # [1] evidence of a mean above zero
+    down: Any = 0.0  # [1] of one below
+
+
+def cusum(state: Cusum, value, slack, valid: Any = True) -> tuple[Cusum, Any]:
+    """Page's CUSUM for a shift of the mean, two-sided: up' = max(0, up + value - slack), down' = max(0, down - value - slack).
+
+    Args:
+        state: `Cusum()` at the start and after an alarm that was dealt with.
+        value: residual normalised to unit variance [1].
+        slack: half the smallest shift that matters [1].
+        valid: where False, or value is NaN, the state stays.
+
+    Returns:
+        The state and the larger of the two sums; `jaxatt.thresholds.cusum_threshold` gives the threshold of a
+        false-alarm rate where values are independent.
+    """
+    fed = valid & ~jnp.isnan(value)
+    value = jnp.where(fed, value, 0)
+    ahead = Cusum(jnp.maximum(state.up + value - slack, 0), jnp.maximum(state.down - value - slack, 0))
+    state = jax.tree.map(lambda new, old: jnp.where(fed, new, old), ahead, state)
+    return state, jnp.maximum(state.up, state.down)
+
+
+def glr(sums, value, valid: Any = True):
+    """Generalised likelihood ratio of a jump of the mean at one of the last M values, of unit variance before and after.
+
+    max over m <= M of (sum of the last m values)^2 / (2 m): the log-likelihood ratio of the best jump.
+
+    Args:
+        sums: (M,) sums of the last 1, ..., M values; zeros at the start.
+        value: residual normalised to unit variance [1].
+        valid: where False, or value is NaN, the state stays.
+
+    Returns:
+        The sums, the statistic [1], and how many values ago, counting the last, the best jump lies.
+    """
+    fed = valid & ~jnp.isnan(value)
+    sums = jnp.where(fed, pushed(sums, 0) + jnp.where(fed, value, 0), sums)
+    ratio = sums * sums / (2 * jnp.arange(1, sums.shape[0] + 1))
+    return sums, jnp.max(ratio, axis=0), 1 + jnp.argmax(ratio, axis=0)
+
+
+def persistence(count, up, most, valid: Any = True):
+    """How long something persists: one more where it is up, one less where not, between 0 and most.
+
+    An alarm at ``count >= most`` needs most ticks more with it than without. valid: where False the count stays.
+    """
+    ahead = jnp.where(up, jnp.minimum(count + 1, most), jnp.maximum(count - 1, 0))
+    return jnp.where(valid, ahead, count)
