@@ -191,3 +191,43 @@ def quaternion_pd(
     shorter = jnp.where(e.w < 0, -1, 1)
     wanted = a - (2 * bandwidth**2 * shorter) * e.v - (2 * damping * bandwidth) * e_w
     return J @ wanted + cross(w, J @ w + stored)
+
+
+# magnetic torquers: the dipole moment m gives the torque m x B
+
+
+def bdot(field: Vec3, last: Vec3, hold, gain, moment_max) -> Vec3:
+    """Dipole moment [A m^2] that takes rate out of a tumbling body: -k (B - B_last) / hold / |B|^2, each axis limited.
+
+    It damps towards the turning of the field, about twice the orbit's rate; the rate about B is not damped. The sample
+    time must be short against the tumbling, rate * hold << 1.
+
+    field, last: the field in body axes at this reading and the one before [T]; hold [s] between them; gain [N m s]:
+    `bdot_gain`; moment_max [A m^2].
+    """
+    change = (field - last) / hold
+    return saturated(-_per_square(gain, field) * change, moment_max)
+
+
+def bdot_gain(orbit_rate, inclination, least_moment):
+    """The gain 2 n (1 + sin xi) J_min [N m s] of Avanzini & Giulietti (2012); a higher one is not faster.
+
+    orbit_rate n [rad/s]; inclination xi of the orbit to the geomagnetic equator [rad]; least_moment J_min: of the three
+    principal moments of inertia [kg m^2].
+    """
+    return 2 * orbit_rate * (1 + jnp.sin(inclination)) * least_moment
+
+
+def unloading(momentum: Vec3, field: Vec3, gain, moment_max) -> Vec3:
+    """Dipole moment [A m^2] that takes momentum out of wheels: k (h x B) / |B|^2, each axis limited.
+
+    Its torque is -k times the part of h across B: the gain k [1/s] is the rate at which that part decays while the wheels
+    hold the body. momentum h: of all wheels in body axes [N m s]; field B in body axes [T]; moment_max [A m^2].
+    """
+    return saturated(_per_square(gain, field) * cross(momentum, field), moment_max)
+
+
+def _per_square(gain, field: Vec3):
+    """gain / |B|^2, and 0 without a field: before the first reading torquers stay off."""
+    square = field @ field
+    return jnp.where(square > 0, gain / jnp.where(square > 0, square, 1), 0)

@@ -161,7 +161,7 @@ def held_torque(wheel: TorqueWheel, motor, speed, dt):
     return wheel.J * (after - speed) / dt
 
 
-def wheel_torque(wheel: TorqueWheel, demand, speed, dt, drive=1.0, wear=1.0, seized=False):
+def wheel_torque(wheel: TorqueWheel, demand, speed, dt, drive: Any = 1.0, wear: Any = 1.0, seized: Any = False):
     """Torque on the wheel [N m] for a demand, held over dt: `motor_torque` and `held_torque`, with the faults of this tick.
 
     drive: share of the demand that the motor gives, 0 for a dead one, which keeps its friction; wear: factor on friction;
@@ -222,6 +222,26 @@ def _in_use(axes, up) -> Vec3:
         check.refuse("up", must, f"of shape {jnp.shape(up)}")
     up = 1.0 * jnp.asarray(up)
     return Vec3(*(jnp.stack(jnp.broadcast_arrays(*row)) * up for row in zip(*vectors)))
+
+
+def refuse_flat(name: str, axes, up: Any = 1.0) -> None:
+    """Refuse, with ValueError, wheels that cannot turn the body about every axis: fewer than three, parallel, in one plane.
+
+    For the check of a loop that needs all three; `allocation` gives what such wheels can.
+
+    name: what the message calls the axes; axes: as of `allocation`, scenarios last; up: (n,), 1 for a wheel in use, or 1
+    for all. Tracers pass.
+    """
+    if check.concrete((axes, up)):
+        W = (
+            np.stack([np.stack(np.broadcast_arrays(*axis)) for axis in columns(axes)]).T
+            * np.atleast_1d(up).T[..., None, :]
+        )
+        W = np.concatenate(
+            [W, np.zeros((*W.shape[:-1], 2))], axis=-1
+        )  # so that one wheel, too, has three singular values
+        least = np.linalg.svd(W, compute_uv=False)[..., 2]
+        check.each(name, "span space (least singular value above 1e-6)", least, least > 1e-6)
 
 
 def allocation(T: Vec3, axes, up):

@@ -28,6 +28,7 @@ from jaxatt.wheels import (
     null_part,
     park_pyramid,
     pyramid,
+    refuse_flat,
     relative_speed,
     wheel_acceleration,
     wheel_drive,
@@ -353,7 +354,7 @@ def test_minimax_is_the_linear_programs_on_every_subset(n):
             np.append(np.zeros(m), 1.0), np.concatenate([above, below]), np.zeros(2 * m),
             np.append(W[:, used], np.zeros((3, 1)), axis=1), T, [(None, None)] * (m + 1), method="highs",
         )  # fmt: skip
-        assert np.abs(u).max() == pytest.approx(least.fun, rel=1e-8)
+        assert np.abs(u).max() == pytest.approx(least.fun, rel=1e-9)
 
 
 def test_minimax_reaches_further_than_the_pseudo_inverse():
@@ -380,6 +381,24 @@ def test_minimax_without_three_independent_wheels_is_the_pseudo_inverse():
         up = np.array(up, float)
         np.testing.assert_allclose(minimax(T, W, up), allocation(T, W, up), atol=1e-15)
         assert np.isfinite(jax.grad(lambda W, up: jnp.sum(minimax(T, W, up) ** 2))(W, up)).all()
+
+
+@pytest.mark.parametrize(
+    "axes, up",
+    [
+        (SETS["one"], 1.0),
+        (SETS["twins"], 1.0),  # all in one plane
+        (SETS["pyramid"], np.array([0, 1, 1, 0.0])),
+        (SETS["pyramid"], np.zeros(4)),
+        (np.repeat(SETS["one"], 4, axis=1), 1.0),  # parallel
+    ],
+)
+def test_wheels_that_do_not_span_space_are_refused(axes, up):
+    refuse_flat("params.axes", SETS["pyramid"])
+    refuse_flat("params.axes", Vec3(*SETS["pyramid"]), np.array([1, 1, 0, 1.0]))
+    refuse_flat("params.axes", pyramid(0.8))
+    with pytest.raises(ValueError, match=r"`params\.axes` must span space \(least .* but it is [0-9.e-]+\.$"):
+        refuse_flat("params.axes", axes, up)
 
 
 def test_null_motion_moves_momentum_that_the_body_does_not_feel():
