@@ -61,6 +61,42 @@ def lanes_last(kernel: Callable, f: Callable, example, *operands, smooth: Callab
     return one(closure, *operands)
 
 
+def in_lanes(kernel: Callable, *operands):
+    """kernel(*operands) for one scenario, of trees of arrays; under `jax.vmap` the batch is the last axis of each."""
+    return lanes_last(lambda _, *operands: kernel(*operands), lambda x: x, 0.0, *operands)
+
+
+# Small matrices in a kernel: arrays (m, n, ...) whose trailing axes are the lanes.
+
+
+def column(v, like):
+    """The components of v as an array, each of the shape of ``like``."""
+    return jnp.stack([jnp.broadcast_to(a, jnp.shape(like)) for a in v])
+
+
+def matrix(m, like):
+    """The matrix m, rows of components such as a `Mat3`, as an array whose entries have the shape of ``like``."""
+    return jnp.stack([column(row, like) for row in m])
+
+
+def times(m, rows) -> list:
+    """m @ rows, a list of rows, of m by rows of k components, such as a `Mat3`, and ``rows`` (k, n, ...)."""
+    return [sum(a * row for a, row in zip(by, rows)) for by in m]
+
+
+def turned(M):
+    """The transpose."""
+    return jnp.swapaxes(M, 0, 1)
+
+
+def mask(pattern, like):
+    """The ``pattern`` of bool, for as many lanes as an entry ``like`` has."""
+    return jnp.asarray(pattern).reshape(*pattern.shape, *(1,) * jnp.ndim(like))
+
+
+# closures
+
+
 def hoisted(f: Callable, example) -> tuple[Callable, list]:
     """f without its closure: g and operands with g(operands, x) = f(x), for batching rules take no closures.
 

@@ -108,7 +108,7 @@ def number(name: str, value) -> float:
 
 
 def fits(name: str, value, other: str, against) -> None:
-    """Refuse what does not broadcast with the other value."""
+    """Refuse a value that does not broadcast with ``against``, the value of ``other``."""
     shape, there = np.shape(value), np.shape(against)
     if any(1 != m != n != 1 for m, n in zip(shape[::-1], there[::-1])):
         refuse(name, f"have a shape that fits that of `{other}`, {there}", f"of shape {shape}")

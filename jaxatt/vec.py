@@ -216,8 +216,8 @@ def diagonal(d) -> Mat3:
     return Mat3(Vec3(x, o, o), Vec3(o, y, o), Vec3(o, o, z))
 
 
-def scaled_identity(s=1.0) -> Mat3:
-    """s I."""
+def scaled_identity(s: Any = 1.0) -> Mat3:
+    """s I, the unit matrix by default."""
     return diagonal((s, s, s))
 
 

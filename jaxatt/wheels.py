@@ -11,6 +11,7 @@ from __future__ import annotations
 from itertools import combinations
 from typing import Annotated, Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -196,8 +197,9 @@ def pyramid(skew, azimuth=np.pi / 4) -> tuple[Vec3, Vec3, Vec3, Vec3]:
     elevation over the x-y plane is 90 deg less it. azimuth: [rad] of the first axis in the x-y plane, from x to y; the
     others follow by 90 deg.
     """
-    s, c = jnp.sin(skew), jnp.cos(skew)
-    x, y = s * jnp.cos(azimuth), s * jnp.sin(azimuth)
+    m = jnp if any(isinstance(a, jax.Array) for a in (skew, azimuth)) else np  # at import nothing runs on JAX
+    s, c = m.sin(skew), m.cos(skew)
+    x, y = s * m.cos(azimuth), s * m.sin(azimuth)
     return Vec3(x, y, c), Vec3(-y, x, c), Vec3(-x, -y, c), Vec3(y, -x, c)
 
 

@@ -1,10 +1,12 @@
 """Gradients beside central differences, by one small program."""
 
+from typing import Any
+
 import jax
 import numpy as np
 
 
-def slopes(cost, at, step=1e-6):
+def slopes(cost, at, step: Any = 1e-6):
     """Gradients of a cost of n numbers, by reverse mode and by central differences, (..., n) each.
 
     at: (..., n) points; step: of the differences, one for all numbers or (n,).

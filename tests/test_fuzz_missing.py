@@ -11,11 +11,12 @@ from abuse import fuzzed
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxatt import Now, Vec3, filters, star_filters
+from jaxatt import Now, Quat, Vec3, filters, mekf, star_filters
+from jaxatt.attitude import vector_from_quat
 from jaxatt.faults import Reading, known, present
 from jaxatt.loops import observer_pd
 from jaxatt.observers import AttitudeRate
-from jaxatt.vec import array
+from jaxatt.vec import array, zeros
 
 VALUES = [0.0, 1.0, -3.0, 1e-6, 1e6, float("nan"), float("inf"), -float("inf")]
 VARIANCES = [1.0, 1e-3, 0.0, 1e6, -1.0, -1e-9, float("nan")]
@@ -38,7 +39,15 @@ def few(P, R, y, valid):
     return star_filters.Belief(array(mean), jnp.array(cov)), told
 
 
-@pytest.mark.parametrize("update", [dense, few])
+@jax.jit
+def by_vector(P, R, y, valid):
+    belief = mekf.Mekf(Quat(1.0, 0.0, 0.0, 0.0), zeros(), jnp.diag(jnp.concatenate([P, jnp.ones(3)])))
+    belief = jax.tree.map(lambda a: jnp.asarray(a, float), belief)
+    after, told = mekf.update_vector(belief, Reading(Vec3(*y), valid[0]), Vec3(0.2, -0.9, 0.4), R)
+    return filters.Belief(array(vector_from_quat(after.q)), after.P[:3, :3]), told
+
+
+@pytest.mark.parametrize("update", [dense, few, by_vector])
 def test_updates(update):
     @fuzzed
     @given(spread, st.sampled_from(VARIANCES), three, flags)
