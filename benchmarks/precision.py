@@ -19,7 +19,7 @@ import numpy as np
 
 import jaxatt
 from jaxatt import simulate
-from jaxatt.loops import cmg_loss, gyro_ekf, observer_pd, star_isolation, wheel_mrac
+from jaxatt.loops import cmg_loss, gyro_ekf, microsat, observer_pd, star_isolation, wheel_mrac
 
 NAMES = (
     "observer_pd",
@@ -29,6 +29,7 @@ NAMES = (
     "cmg_loss",
     "star_isolation",
     "wheel_mrac",
+    "microsat",
 )
 
 
@@ -49,6 +50,8 @@ def case(name: str):
             return star_isolation.system, star_isolation.params, star_isolation.scenario, 200.0, 1
         case "wheel_mrac":
             return wheel_mrac.system, wheel_mrac.params, wheel_mrac.scenario, 90.0, 1
+        case "microsat":
+            return microsat.system, microsat.params, microsat.scenario, 200.0, 10
     raise SystemExit(f"`name` must be one of {NAMES}, but it is {name}.")
 
 

@@ -25,6 +25,7 @@ from jaxatt.campaign.summary import describe, sensitivity
 from jaxatt.faults import dead_where
 from jaxatt.loops import cmg_loss as cmg
 from jaxatt.loops import gyro_ekf as ekf
+from jaxatt.loops import microsat as micro
 from jaxatt.loops import observer_pd as op
 from jaxatt.loops import star_isolation as star
 from jaxatt.loops import wheel_mrac as wm
@@ -161,6 +162,49 @@ def scenario_wheel(d):
     return params, wm.scenario._replace(J_z=d["J_z"], noise=d["noise"], wheel=wheel, drive=drive)
 
 
+# microsat: one fault of any kind in any unit, on an axis or, axis 3, on all, anywhere on the orbit
+
+UNITS = "none", "wheel", "gyro", "star", "star tracker", "sun sensor", "magnetometer", "tachometer"
+KINDS = "bias", "drift", "noise", "dead", "stuck", "missing"  # of a wheel: share of its torque, friction, seized, twice
+
+
+def draw_microsat(u):
+    return dict(
+        t0=between(u[0], 0, 5676.98), unit=one_of(u[1], len(UNITS)), kind=one_of(u[2], len(KINDS)), axis=one_of(u[3], 4),
+        size=between_logs(u[4], 0.05, 1), onset=between(u[5], 100, 200), turn=ndtri(u[6:9]), bias=ndtri(u[9:12]),
+        friction=between(u[12:16], 0.9, 1.1),
+    )  # fmt: skip
+
+
+def scenario_microsat(d):
+    def fault(unit, full, hit: Any = True):
+        """Of so large a size; a drift reaches it after 100 s."""
+        here = (d["unit"] == UNITS.index(unit)) & hit
+        of = lambda kind, value, none=0.0: jnp.where(here & (d["kind"] == KINDS.index(kind)), value, none)
+        size = full * d["size"]
+        return Fault(
+            jnp.where(here, d["onset"], jnp.inf), bias=of("bias", size), drift=of("drift", 1e4 * size), tau=1e6,
+            random=of("noise", size), scale=of("dead", 0.0, 1.0), stuck=of("stuck", 1.0), missing=of("missing", 1.0),
+        )  # fmt: skip
+
+    def triad(unit, full):
+        return Vec3(*(fault(unit, full, (d["axis"] == i) | (d["axis"] == 3)) for i in range(3)))
+
+    this = np.arange(4) == d["axis"]
+    hit = (d["unit"] == 1) & this
+    of = lambda kind, value, none: jnp.where(hit & (d["kind"] % 3 == kind), value, none)
+    wheel = micro.WheelFault(
+        jnp.where(hit, d["onset"], jnp.inf), np.full(4, np.inf),
+        of(0, 1 - d["size"], 1.0), of(1, 1 + 9 * d["size"], 1.0), of(2, 1.0, 0.0),
+    )  # fmt: skip
+    return micro.scenario._replace(
+        t0=d["t0"], friction=d["friction"], wheel=wheel, tacho=fault("tachometer", 1e-3, this),
+        turn=micro.params.sigma_turn * Vec3(*d["turn"]), bias=micro.params.sigma_bias * Vec3(*d["bias"]),
+        gyro=triad("gyro", 0.1 * DEG), star=triad("star", 1 * DEG), box=fault("star tracker", 0.0),
+        sun=triad("sun sensor", 0.1), field=triad("magnetometer", 5e-6),
+    )  # fmt: skip
+
+
 PLANS = {
     "observer_pd": Plan(
         op.system, op.params, op.score, 700, 4, draw_observer, scenario_observer, dict(size="MRP or rad/s", onset="s"),
@@ -182,6 +226,11 @@ PLANS = {
         varied(wm.system_of(substeps=8)), (), varied(wm.score), 4501, 9, draw_wheel, scenario_wheel,
         dict(believed_J="kg m^2", K="1/s", gamma="s/deg^2", J_z="kg m^2", noise="deg", friction="deg/s^2", onset="s"),
         lambda log: dict(error=log.error),
+    ),
+    "microsat": Plan(
+        micro.system, micro.params, micro.score, 5000, 16, draw_microsat, scenario_microsat,
+        dict(t0="s", size="1", onset="s", turn="sigma", bias="sigma", friction="1"),
+        lambda log: dict(pointing=log.pointing),
     ),
 }  # fmt: skip
 

@@ -35,6 +35,7 @@ EXPERIMENTS = {
     "cmg_loss": Experiment(100, 88, "figure_7"),
     "star_isolation": Experiment(70, 88, "roc"),
     "wheel_mrac": Experiment(30, 77, "loss_of_effectiveness"),
+    "microsat": Experiment(90, 50, "reconfiguration"),
 }
 NAMES = tuple(EXPERIMENTS)
 STUDIES = {"tune": "experiments.tuning"}  # words that may follow the names, and where the studies lie

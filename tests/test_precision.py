@@ -9,7 +9,7 @@ import pytest
 from benchmarks.precision import NAMES, case, deviations
 from jaxatt import star_filters
 from jaxatt.engine import validated
-from jaxatt.loops import cmg_loss, gyro_ekf, observer_pd, star_isolation, wheel_mrac
+from jaxatt.loops import cmg_loss, gyro_ekf, microsat, observer_pd, star_isolation, wheel_mrac
 
 LOST = [  # system, params, scenario, what float32 loses of it
     (gyro_ekf.system, gyro_ekf.consistent(gyro_ekf.params), gyro_ekf.scenario, "the filter's covariance"),
@@ -21,6 +21,7 @@ LOST = [  # system, params, scenario, what float32 loses of it
     (star_isolation.system_of(star_filters.MEKF), star_isolation.params, star_isolation.scenario, None),
     (observer_pd.system, observer_pd.params, observer_pd.scenario, None),
     (wheel_mrac.system, wheel_mrac.params, wheel_mrac.scenario, None),
+    (microsat.system, microsat.params, microsat.scenario, None),
 ]
 
 
