@@ -27,7 +27,7 @@ gc.set_threshold(50_000, 20, 50)  # programs and traces are many objects that st
 # short, go without most of them. All others, with long runs or with bits to compare, are compiled as a user's are.
 SHORT = {
     "test_attitude", "test_bodies", "test_controllers", "test_detection", "test_engine", "test_environment", "test_filters",
-    "test_flags", "test_guidance", "test_linear", "test_mekf", "test_replay", "test_sensors", "test_soft_scores",
+    "test_flags", "test_guidance", "test_linear", "test_mekf", "test_replay", "test_soft_scores",
     "test_torque_matrix", "test_tuning_star_isolation", "test_usque", "test_wheels",
 }  # fmt: skip
 

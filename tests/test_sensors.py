@@ -98,7 +98,7 @@ def test_rate_maps_are_exact_for_axes_that_are_nearly_parallel():
     axes = gyro_pyramid(1e-3, 60 * DEG)
     G = np.asarray(project(axes, Vec3.of(np.eye(3))))
     np.testing.assert_allclose(rate_maps(axes)[7], np.linalg.pinv(G * [[1], [1], [1], [0]]), rtol=1e-9, atol=1e-9)
-    np.testing.assert_array_equal(rate_maps(G.T), rate_maps(axes))  # an array (3, n) is read by columns
+    np.testing.assert_allclose(rate_maps(G.T), rate_maps(axes), rtol=1e-9, atol=1e-9)  # an array (3, n): columns
 
 
 def test_the_parity_vector_watches_what_it_can_where_three_axes_lie_in_a_plane():
