@@ -173,8 +173,7 @@ def batched(day: ms.Scenario, ticks: int, noise, real: Any = np.float64):
     std_star = number([p.star.cross, p.star.cross, p.star.roll])
     arw, rrw, null, friction = p.gyro.arw, p.gyro.rrw, number(ms.NULL), p.wheel.friction
     t0, dipole = np.asarray(day.t0, float), number(ms.scenario.dipole)
-    field, sun, lit, r, v, rho = surroundings(table, number(t0))
-    q, w = nadir(r, v)
+    q, w = nadir(*surroundings(table, number(t0))[3:5])
     h, wear = number(day.h), number(day.friction)
     theta, last_theta, bias = np.zeros_like(w), np.zeros_like(w), three(day.bias)
     qh = product(q, exponential(-three(day.turn)))
@@ -185,9 +184,14 @@ def batched(day: ms.Scenario, ticks: int, noise, real: Any = np.float64):
     wheel, gyro = (np.zeros_like(h),) * 2, (np.zeros_like(w),) * 2
     nis_ring, cross_ring, dof_ring = np.full((n, 20), 3, real), np.zeros((n, 4), real), np.full((n, 4), 6, real)
     rejected, in_use, line, held_field = np.zeros(n), np.ones((n, 4), bool), [], np.zeros((n, 3))
-    told = np.zeros((ticks, 4, n), real)
     worst = np.zeros((4, n))
-    for k in range(ticks):
+
+    def tick(k, state):
+        """One tick of everything, apart from the loop, which type checkers would go round for minutes."""
+        (
+            bias, theta, last_theta, q, w, h, qh, bh, qc, wm, P, tacho_last, reference, torque, moment, wheel, gyro, rejected,
+            in_use, line, held_field,
+        ) = state  # fmt: skip
         field, sun, lit, r, v, rho = surroundings(table, number(t0 + k * ms.DT))
         drawn = noise(k)
         # sensors
@@ -294,7 +298,6 @@ def batched(day: ms.Scenario, ticks: int, noise, real: Any = np.float64):
             -p.moment_max,
             p.moment_max,
         )
-        tacho_last = tacho
         # tallies
         true_e = product(conjugate(wanted_q), q)
         pointing, rate_error = (
@@ -302,7 +305,6 @@ def batched(day: ms.Scenario, ticks: int, noise, real: Any = np.float64):
             np.linalg.norm(w - body(true_e, wanted_w), axis=1),
         )
         knowledge = np.linalg.norm(logarithm(product(conjugate(qh), q)), axis=1)
-        told[k] = pointing, knowledge, rate_error, nis
         # the truth ahead
         speed = h / p.wheel.J - w @ W
         outward = np.sign(torque) * speed
@@ -329,17 +331,27 @@ def batched(day: ms.Scenario, ticks: int, noise, real: Any = np.float64):
         outer += 3 * MU / distance**3 * np.cross(down, down @ J.T) + np.cross(moment + dipole, fB)
         outer = (outer - given @ W.T).astype(real)
 
-        def rates(q, w, h, outer=outer, given=given):
+        def rates(q, w, h):
             spin = np.concatenate([np.zeros((n, 1), real), w], axis=1)
             return 0.5 * product(q, spin), (outer - np.cross(w, w @ J.T + h @ W.T)) @ Jinv.T, given, w
 
-        state, total = (q, w, h, theta), None
-        at = state
-        for by, weight in ((0.5, 1), (0.5, 2), (1.0, 2), (0.0, 1)):
-            slope = rates(*at[:3])
-            total = [weight * s / 6 + (0 if total is None else total[i]) for i, s in enumerate(slope)]
-            at = tuple(a + by * dt * s for a, s in zip(state, slope))
-        assert total is not None
-        q, w, h, theta = (a + dt * s for a, s in zip(state, total))
-        q = normal(q)
+        truth, slopes = (q, w, h, theta), []
+        at = truth
+        for by in (0.5, 0.5, 1, 0):
+            slopes.append(rates(*at[:3]))
+            at = [a + by * dt * s for a, s in zip(truth, slopes[-1])]
+        q, w, h, theta = (a + dt * (k1 + 2 * k2 + 2 * k3 + k4) / 6 for a, k1, k2, k3, k4 in zip(truth, *slopes))
+        ahead = (
+            bias, theta, last_theta, normal(q), w, h, qh, bh, qc, wm, P, tacho, reference, torque, moment, wheel, gyro, rejected,
+            in_use, line, held_field,
+        )  # fmt: skip
+        return ahead, (pointing, knowledge, rate_error, nis)
+
+    state = (
+        bias, theta, last_theta, q, w, h, qh, bh, qc, wm, P, tacho_last, reference, torque, moment, wheel, gyro, rejected,
+        in_use, line, held_field,
+    )  # fmt: skip
+    told = np.zeros((ticks, 4, n), real)
+    for k in range(ticks):
+        state, told[k] = tick(k, state)
     return told
