@@ -249,8 +249,8 @@ def faults(report) -> None:
     n = 32 if report.quick else 800
     scenarios = with_faults(days(21, n), [case.fault for case in CASES.values()])
     with_, without = (
-        jax.tree.map(lambda a: a.reshape(len(CASES), n, *a.shape[1:]), swept(AT_ALARM, days, 2).run)
-        for days in (scenarios, only_watched(scenarios))
+        jax.tree.map(lambda a: a.reshape(len(CASES), n, *a.shape[1:]), swept(AT_ALARM, these, 2).run)
+        for these in (scenarios, only_watched(scenarios))
     )
     report.check("share of finite runs with faults", 1, with_.ok.mean(), 0, f"{with_.ok.size} runs of 500 s")
     when = alarms(with_) - ONSET  # (3, cases, n)

@@ -84,7 +84,7 @@ def times(m, rows) -> list:
     return [sum(a * row for a, row in zip(by, rows)) for by in m]
 
 
-def turned(M):
+def transposed(M):
     """The transpose."""
     return jnp.swapaxes(M, 0, 1)
 

@@ -33,11 +33,11 @@ from jaxatt.attitude import (
     quat_to_body,
     vector_from_quat,
 )
-from jaxatt.batching import column, in_lanes, mask, matrix, times, turned
+from jaxatt.batching import column, in_lanes, mask, matrix, times, transposed
 from jaxatt.compiling import shared
 from jaxatt.faults import Reading
-from jaxatt.filters import Innovation
-from jaxatt.vec import Mat3, Quat, Vec3, diagonal, outer, polynomial, scaled_identity, skew, where, zeros
+from jaxatt.filters import Belief, Innovation, nees
+from jaxatt.vec import Mat3, Quat, Vec3, array, diagonal, outer, polynomial, scaled_identity, skew, where, zeros
 
 TURN, BIAS, CLONE = 0, 3, 6  # where their rows begin
 
@@ -65,7 +65,7 @@ def start(q: Quat, b: Vec3, sigma_turn, sigma_bias) -> Mekf:
     """The belief in attitude q and bias b [rad/s], off by sigma_turn [rad] and sigma_bias [rad/s] about every axis."""
     kind = jnp.result_type(float, *jax.tree.leaves((q, b, sigma_turn, sigma_bias)))
     q, b, sigma_turn, sigma_bias = jax.tree.map(lambda a: jnp.asarray(a, kind), (q, b, sigma_turn, sigma_bias))
-    return Mekf(q, b, in_lanes(partial(_apart, 6), sigma_turn, sigma_bias))
+    return Mekf(q, b, in_lanes(partial(_independent, 6), sigma_turn, sigma_bias))
 
 
 def restarted(belief: Mekf, when, b: Vec3, sigma_turn, sigma_bias) -> Mekf:
@@ -73,7 +73,7 @@ def restarted(belief: Mekf, when, b: Vec3, sigma_turn, sigma_bias) -> Mekf:
 
     b [rad/s], sigma_turn [rad] and sigma_bias [rad/s] are those of `start`; a clone is the attitude.
     """
-    P = in_lanes(_begun_anew, belief.P, when, jnp.asarray(sigma_turn), jnp.asarray(sigma_bias))
+    P = in_lanes(_restarted, belief.P, when, jnp.asarray(sigma_turn), jnp.asarray(sigma_bias))
     clone = None if belief.clone is None else where(when, belief.q, belief.clone)
     return Mekf(belief.q, where(when, b, belief.b), P, clone)
 
@@ -190,8 +190,8 @@ def mekf_nees(belief: Mekf, q: Quat, b: Vec3):
 
     The clone is left out: right after cloning the whole covariance is singular. NaN: P is no covariance.
     """
-    error = vector_from_quat(quat_conjugate(belief.q) * q), b - belief.b
-    return in_lanes(_squared, belief.P, error)
+    error = jnp.concatenate([array(vector_from_quat(quat_conjugate(belief.q) * q)), array(b - belief.b)])
+    return nees(Belief(jnp.zeros_like(error), belief.P[:CLONE, :CLONE]), error)
 
 
 def _update(belief: Mekf, at: int, H: Mat3, value: Vec3, R: Vec3, due, gate, spread: bool) -> tuple[Mekf, Innovation]:
@@ -213,15 +213,15 @@ def not_negative(P):
     return jnp.all(jnp.stack([P[i, i] >= 0 for i in range(len(P))]), axis=0)
 
 
-def _apart(n: int, sigma_turn, sigma_bias):
-    """P of turn and bias off by so much about every axis; the clone is the turn."""
+def _independent(n: int, sigma_turn, sigma_bias):
+    """P of independent errors of turn and bias, of these deviations about every axis; the clone is the turn."""
     same = np.arange(n) % CLONE
     variances = jnp.stack([(sigma_turn if i < BIAS else sigma_bias) ** 2 for i in same])
     return jnp.where(mask(same[:, None] == same, sigma_turn), variances[:, None], 0)
 
 
-def _begun_anew(P, when, sigma_turn, sigma_bias):
-    return jnp.where(when, _apart(len(P), sigma_turn, sigma_bias), P)
+def _restarted(P, when, sigma_turn, sigma_bias):
+    return jnp.where(when, _independent(len(P), sigma_turn, sigma_bias), P)
 
 
 def _with_clone(P):
@@ -234,10 +234,10 @@ def _spread(P, step: Step):
     """Phi P Phi' + Q."""
     like, joint = P[0, 0], [(*a, *b) for a, b in zip(step.turn, step.drift)]
     top = jnp.stack(times(joint, P[:CLONE]))  # of Phi P
-    aa = jnp.stack(times(joint, turned(top[:, :CLONE])))
-    top = top.at[:, :BIAS].set(0.5 * (aa + turned(aa)) + matrix(step.aa, like))
+    aa = jnp.stack(times(joint, transposed(top[:, :CLONE])))
+    top = top.at[:, :BIAS].set(0.5 * (aa + transposed(aa)) + matrix(step.aa, like))
     top = top.at[:, BIAS:CLONE].add(matrix(step.ab, like))
-    P = P.at[:BIAS].set(top).at[BIAS:, :BIAS].set(turned(top[:, BIAS:]))
+    P = P.at[:BIAS].set(top).at[BIAS:, :BIAS].set(transposed(top[:, BIAS:]))
     return P.at[BIAS:CLONE, BIAS:CLONE].add(matrix(step.bb, like))
 
 
@@ -259,7 +259,7 @@ def _told(at: int, spread: bool, P, H: Mat3, value: Vec3, R: Vec3, due, gate):
         found = shared(times, M @ H, P[at : at + 3])  # three rows (n, ...)
         weighed = [w * c for w, c in zip(weights, found)]
         moved = times([residuals], weighed)[0]
-        gain = turned(jnp.stack(times(M.T, weighed)))
+        gain = transposed(jnp.stack(times(M.T, weighed)))
         after = P - sum(w * (c[:, None] * c) for w, c in zip(weights, found))
         least = jnp.minimum(P, 0)  # rounding makes no variance negative
         after = jnp.where(mask(np.eye(n, dtype=bool), like), jnp.maximum(after, least), after)
@@ -301,21 +301,8 @@ def _as_seen_after(P, moved):
     for at in range(0, len(P), CLONE):
         G = left_jacobian(-Vec3.of(moved[at : at + 3]))
         for _ in range(2):  # G P, then its transpose times G'
-            P = turned(P.at[at : at + 3].set(jnp.stack(times(G, P[at : at + 3]))))
-    return 0.5 * (P + turned(P))
-
-
-def _squared(P, error: tuple[Vec3, Vec3]):
-    """e' P^-1 e of turn and bias, one number after the other known exactly."""
-    e = column((*error[0], *error[1]), P[0, 0])
-
-    def known(k, carry):
-        P, e, total = carry
-        by = jnp.where(P[k, k] > 0, 1 / jnp.where(P[k, k] > 0, P[k, k], 1), jnp.nan)
-        share = by * P[k]
-        return P - share[:, None] * P[k], e - share * e[k], total + by * e[k] * e[k]
-
-    return jax.lax.fori_loop(0, CLONE, known, (P[:CLONE, :CLONE], e, jnp.zeros_like(e[0])))[2]
+            P = transposed(P.at[at : at + 3].set(jnp.stack(times(G, P[at : at + 3]))))
+    return 0.5 * (P + transposed(P))
 
 
 def _shapes(xx):

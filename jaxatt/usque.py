@@ -22,7 +22,7 @@ import numpy as np
 
 from jaxatt import check
 from jaxatt.attitude import quat_conjugate, quat_from_mrp, quat_from_vector, quat_normalised, quat_to_body
-from jaxatt.batching import column, in_lanes, mask, matrix, times, turned
+from jaxatt.batching import column, in_lanes, mask, matrix, times, transposed
 from jaxatt.compiling import shared
 from jaxatt.faults import Reading
 from jaxatt.filters import Innovation
@@ -94,19 +94,19 @@ def _step(belief: Mekf, rate, dt, arw, rrw, value, reference, std, valid) -> tup
     residual = where(due, value - expected - Vec3.of(mean[6:]), zeros())
     safe = where(due, S, scaled_identity(jnp.ones_like(std)))
     inv = inverse(safe)
-    across = turned(G[:6, 6:])  # (3, 6, ...)
+    across = transposed(G[:6, 6:])  # (3, 6, ...)
     gain = jnp.where(due, jnp.stack(times(inv, across)), 0)  # transposed
     moved = times([residual], gain)[0] + jnp.where(mask(np.arange(6) < 3, std), mean[:6], 0)
-    less = jnp.stack(times(turned(gain), across))
+    less = jnp.stack(times(transposed(gain), across))
     ahead = Mekf(
         quat_normalised(q * quat_from_mrp(Vec3.of(moved[:3]) / 4)),
         belief.b + Vec3.of(moved[3:]),
-        P - 0.5 * (less + turned(less)),
+        P - 0.5 * (less + transposed(less)),
     )
     nis, rows = residual @ (inv @ residual), 3 * due.astype(std.dtype)
     nll = 0.5 * (nis + jnp.where(due, jnp.log(det(safe)), 0) + rows * log(2 * pi))
     impossible = jnp.where(possible, 0, jnp.nan)
-    told = Innovation(column(residual, std), matrix(S, std), nis + impossible, rows, nll + impossible, turned(gain))
+    told = Innovation(column(residual, std), matrix(S, std), nis + impossible, rows, nll + impossible, transposed(gain))
     return where(sound, ahead, belief._replace(q=q)), told
 
 
@@ -120,7 +120,7 @@ def _spread(P, noise):
         return S - below[:, None] * below, L.at[j].set(below)
 
     S = 7 * (P + jnp.where(mask(np.eye(6, dtype=bool), noise[0]), noise, 0))
-    half = turned(jax.lax.fori_loop(0, 6, next_column, (S, jnp.zeros_like(S)))[1])
+    half = transposed(jax.lax.fori_loop(0, 6, next_column, (S, jnp.zeros_like(S)))[1])
     return jnp.concatenate([half, -half], axis=1)
 
 

@@ -465,7 +465,9 @@ def star_sample(params: Params, computer: Computer, arrived: Exposure) -> tuple[
     """The filter updated by a star sample that is no stranger, and the sample's check against Sun and magnetic field."""
     limits = params.limits
     wanted = ~acted_on(computer).star_out
-    gate = jnp.where(computer.act, jnp.where(wanted, limits.gate, -1.0), jnp.inf)
+    gate = jnp.where(
+        computer.act, jnp.where(wanted, limits.gate, -1.0), jnp.inf
+    )  # -1: no sample is used, its NIS is told
     variance = Vec3(params.star.cross**2, params.star.cross**2, params.star.roll**2)
     belief, met = update_attitude(computer.belief, arrived.star, star_axes(params.star), variance, True, gate)
     came = arrived.star.valid & (met.nis > 0)
