@@ -24,7 +24,8 @@ matplotlib.use("Agg")
 gc.set_threshold(50_000, 20, 50)  # programs and traces are many objects that stay
 
 # XLA's optimisations take longer than they save where runs are short: the programs of these modules, and of tests marked
-# short, go without most of them. All others, with long runs or with bits to compare, are compiled as a user's are.
+# short, go without most of them. All others, with long runs or with bits to compare, are compiled as a user's are: JAX
+# keeps programs of another matmul precision apart, which means nothing on a CPU, but not those of other optimisations.
 SHORT = {
     "test_attitude", "test_bodies", "test_controllers", "test_detection", "test_engine", "test_environment", "test_filters",
     "test_flags", "test_guidance", "test_linear", "test_mekf", "test_replay", "test_soft_scores",
@@ -37,3 +38,4 @@ def pytest_runtest_setup(item):
     """Before the fixtures, which compile too."""
     short = item.module.__name__ in SHORT or item.get_closest_marker("short") is not None
     jax.config.update("jax_disable_most_optimizations", short)
+    jax.config.update("jax_default_matmul_precision", "highest" if short else None)
