@@ -190,7 +190,8 @@ def mekf_nees(belief: Mekf, q: Quat, b: Vec3):
 
     The clone is left out: right after cloning the whole covariance is singular. NaN: P is no covariance.
     """
-    error = jnp.concatenate([array(vector_from_quat(quat_conjugate(belief.q) * q)), array(b - belief.b)])
+    turn = shared(lambda p, q: vector_from_quat(quat_conjugate(p) * q), belief.q, q)  # rounded alike in every program
+    error = jnp.concatenate([array(turn), array(b - belief.b)])
     return nees(Belief(jnp.zeros_like(error), belief.P[:CLONE, :CLONE]), error)
 
 
