@@ -183,7 +183,7 @@ def swept(params, scenarios, number: int, ticks: int = TICKS) -> Tallies:
 
 def healthy(report) -> None:
     """Consistency, pointing and false alarms without a fault."""
-    n = 128 if report.quick else 2048
+    n = 128 if report.quick else 10_240
     found = swept(ms.params, days(5, n), 1, ticks=10_000)
     run, hours = found.run, n * 1000 / 3600
     report.check("share of finite healthy runs", 1, run.ok.mean(), 0, f"{n} runs of 1000 s")

@@ -16,6 +16,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 from jax.core import Tracer
+from jax.extend.core import Var
 
 from jaxatt import check
 
@@ -30,9 +31,16 @@ def shared(f: Callable, *operands):
     if not traced_operands or jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
         return f(*operands)
     f = jax.jit(f, inline=True)  # traced once for its shapes and its values
+    found, shapes = jax.make_jaxpr(f, return_shape=True)(*operands)
+    place = {variable: i for i, variable in enumerate(found.jaxpr.invars)}
     # tied to an operand, lest reverse mode on JAX 0.10 takes the branch apart before the operand is known
     always, _ = jax.lax.optimization_barrier((jnp.asarray(True), jax.lax.stop_gradient(traced_operands[0])))
-    return jax.lax.cond(always, f, lambda *_: zeros(jax.eval_shape(f, *operands)), *operands)
+    out = jax.lax.cond(always, f, lambda *_: zeros(shapes), *operands)
+    # what f returns as it got it goes around the boundary, where a batch would be turned to lead and back
+    given, outvars = [jnp.asarray(a) for a in jax.tree.leaves(operands)], found.jaxpr.outvars
+    leaves, treedef = jax.tree.flatten(out)
+    kept = [given[place[v]] if isinstance(v, Var) and v in place else a for v, a in zip(outvars, leaves)]
+    return jax.tree.unflatten(treedef, kept)
 
 
 def zeros(shapes):
@@ -67,8 +75,8 @@ def jitted(f: Callable, static: int = 0) -> Callable:
 
 _FLAGS = {
     "--xla_cpu_prefer_vector_width": "512",
-    # loops of up to 10 MB become one compiled function; larger ones, of gradients, would take minutes to compile
-    "--xla_backend_extra_options": "xla_cpu_small_while_loop_byte_threshold=10000000",
+    # loops of up to 20 MB become one compiled function; larger ones, of gradients, would take minutes to compile
+    "--xla_backend_extra_options": "xla_cpu_small_while_loop_byte_threshold=20000000",
 }
 
 

@@ -222,7 +222,8 @@ def _independent(n: int, sigma_turn, sigma_bias):
 
 
 def _restarted(P, when, sigma_turn, sigma_bias):
-    return jnp.where(when, _independent(len(P), sigma_turn, sigma_bias), P)
+    anew = lambda P: jnp.where(when, _independent(len(P), sigma_turn, sigma_bias), P)
+    return jax.lax.cond(jnp.any(when), anew, lambda P: P, P)
 
 
 def _with_clone(P):

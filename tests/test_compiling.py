@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import weakref
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -52,6 +53,16 @@ def test_a_shared_value_can_be_differentiated_both_ways():
 def test_a_shared_value_is_computed_once():
     sines = lambda f: str(jax.jit(f).lower(jnp.zeros(60)).compile().as_text()).count(" sine(")
     assert sines(lambda x: six(x, shared)) == 3
+
+
+def test_what_a_shared_function_returns_as_it_got_it_goes_around():
+    lanes = partial(jax.vmap, in_axes=-1, out_axes=-1)
+    f = lanes(lambda held, a: shared(lambda held, a: dict(held=held, more=a + held[0]), held, a))
+    held, a = np.arange(6.0).reshape(2, 3), np.arange(3.0)
+    program = jax.make_jaxpr(f)(held, a).jaxpr
+    assert program.outvars[0] is program.invars[0]
+    out = f(held, a)
+    assert np.array_equal(out["held"], held) and np.array_equal(out["more"], a + held[0])
 
 
 def test_a_shared_value_may_be_a_tree_of_several_operands():
