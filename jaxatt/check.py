@@ -45,19 +45,26 @@ def concrete(tree) -> bool:
 _batch: ContextVar[tuple] = ContextVar(
     "number of scenarios that are checked, whether params are shared", default=(None, False)
 )
+_end: ContextVar[float] = ContextVar("time of the last tick of the run that is checked [s]", default=0.0)
 
 
 @contextmanager
-def scenarios(n: int | None, params: Any = ()):
+def scenarios(n: int | None, params: Any = (), end: float = 0.0):
     """Within it, the last axis of length n of what is checked holds the scenarios; None: there is just one.
 
-    params: what is named so and shared by the scenarios; () where there is nothing.
+    params: what is named so and shared by the scenarios; () where there is nothing. end: see `last_tick`.
     """
-    token = _batch.set((n, bool(jax.tree.leaves(params))))
+    tokens = _batch.set((n, bool(jax.tree.leaves(params)))), _end.set(end)
     try:
         yield
     finally:
-        _batch.reset(token)
+        _batch.reset(tokens[0])
+        _end.reset(tokens[1])
+
+
+def last_tick() -> float:
+    """Time of the last tick [s] of the run that a loop's ``check`` is called for; 0 where no run is meant."""
+    return _end.get()
 
 
 def each(name: str, must: str, value, good) -> None:

@@ -61,7 +61,7 @@ class System(NamedTuple):
 
     check: what no single field can say (`jaxatt.fields` has the rest). It gets NumPy arrays and is called before
     anything is compiled; a sweep hands it all scenarios at once, behind the axes that one scenario has, so write it
-    with `jaxatt.check` or element by element.
+    with `jaxatt.check` or element by element. `check.last_tick` tells how long the run is, for tables that must reach.
     """
 
     init: Init

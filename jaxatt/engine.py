@@ -225,7 +225,7 @@ def simulate(system: System, params, scenario, noise_or_key, *, ticks: int, ever
         source = noise_or_key
         if source.shape != (ticks, system.normals):
             check.refuse("noise", f"have shape ({ticks}, {system.normals})", source.shape)
-    params, scenario = validated(system, params, scenario)
+    params, scenario = validated(system, params, scenario, ticks=ticks)
     operands = params, scenario, source
     run = compiled(_simulate, 4, operands)
     if not traced(operands):
@@ -279,15 +279,15 @@ def prepared(system: System, params, scenario) -> tuple[Any, Any]:
     return fields.instants(params, put), fields.instants(scenario, put)
 
 
-def validated(system: System, params, scenario, n: int | None = None) -> tuple[Any, Any]:
+def validated(system: System, params, scenario, n: int | None = None, ticks: int = 1) -> tuple[Any, Any]:
     """params and scenario converted to arrays of one floating type and, where they are concrete, checked.
 
-    n: number of scenarios in the first axis of every leaf of scenario; None for a single one.
+    n: number of scenarios in the first axis of every leaf of scenario; None for a single one. ticks: of the run.
     """
     params, scenario = prepared(system, params, scenario)
     last = scenario if n is None else jax.tree.map(_batch_last, scenario)
     fields.validate("params", params)
-    with check.scenarios(n, params):
+    with check.scenarios(n, params, (ticks - 1) * system.dt):
         fields.validate("scenario", last, n)
         if check.concrete((params, scenario)):
             system.check(params, last)

@@ -61,7 +61,8 @@ def span(table: Table) -> tuple[float, float]:
 def refuse_short(name: str, table: Table, first, last) -> None:
     """Refuse, with ValueError, a table that does not reach from first to last [s], numbers or arrays.
 
-    name: what the message calls the table. For the ``check`` of a loop: `at` itself stays at the ends.
+    name: what the message calls the table. For the ``check`` of a loop, with `check.last_tick`: `at` itself stays at the
+    ends.
     """
     begin, end = span(table)
     slack = 1e-6 * (end - begin)

@@ -59,7 +59,7 @@ def sweep(system: System, params, scenarios, key, *, ticks: int, score: Callable
     check.kind("system", system, System)
     ticks, n = check.whole("ticks", ticks), check.batch_size("scenarios", scenarios)
     check.function("score", score)
-    params, scenarios = validated(system, params, scenarios, n)
+    params, scenarios = validated(system, params, scenarios, n, ticks)
     key = one_key(key)
     if traced(params, scenarios, key):
         return _traced(system, score, ticks, params, scenarios, key, n)
@@ -89,7 +89,7 @@ def rerun(system: System, params, scenarios, key, index: int, *, ticks: int):
     index = check.whole("index", index, 0)
     if index >= n:
         check.refuse("index", f"be less than the {n} scenarios", index)
-    params, scenarios = validated(system, params, scenarios, n)
+    params, scenarios = validated(system, params, scenarios, n, ticks)
     here = block_of(jax.tree.map(np.asarray, scenarios), index // BLOCK)
     return logged(system, params, here, one_key(key), index, ticks)
 

@@ -234,6 +234,17 @@ def test_a_table_that_is_too_short_is_refused():
         simulate(ms.system, ms.params, ms.scenario._replace(t0=1e5), KEY, ticks=1)
 
 
+def test_a_table_shorter_than_the_run_is_refused():
+    """It reaches to 12 690 s; the last of so many ticks is one tick later, in the second scenario."""
+    late = repeated(ms.scenario, 2)._replace(t0=np.array([0.0, 12_000.0]))
+    with pytest.raises(
+        ValueError, match=r"`params\.table` must reach from 0 s to 12690\.1 s .* good from 0 s to 12690 s"
+    ):
+        sweep(ms.system, ms.params, late, KEY, ticks=6902, score=ms.score)
+    with pytest.raises(ValueError, match=r"`params\.table` must reach"):
+        simulate(ms.system, ms.params, ms.scenario._replace(t0=12_000.0), KEY, ticks=6902)
+
+
 def test_wheels_of_which_three_lie_in_a_plane_are_refused():
     """The law inverts W W' of the wheels in use, which may be any three."""
     half = np.sqrt(0.5)

@@ -123,7 +123,7 @@ def results(campaign: Campaign, start: int, stop: int, advance: Callable = lambd
     """
     scenarios, inputs = drawn(campaign, start, stop)
     params, scenarios = prepared(campaign.system, campaign.params, scenarios)
-    bad = refused(campaign.system, params, scenarios)
+    bad = refused(campaign.system, params, scenarios, campaign.ticks)
     values = scored(
         campaign.system, params, scenarios, campaign.key, campaign.ticks, campaign.score, start // BLOCK, advance
     )
@@ -142,13 +142,13 @@ def results(campaign: Campaign, start: int, stop: int, advance: Callable = lambd
     return out
 
 
-def refused(system: System, params, scenarios) -> np.ndarray:
+def refused(system: System, params, scenarios, ticks: int) -> np.ndarray:
     """Which of the scenarios their fields or the system's check refuse, (n,) bool."""
     bad = np.zeros(check.batch_size("scenarios", scenarios), bool)
 
     def look(start: int, stop: int):
         try:
-            validated(system, params, jax.tree.map(lambda a: a[start:stop], scenarios), stop - start)
+            validated(system, params, jax.tree.map(lambda a: a[start:stop], scenarios), stop - start, ticks)
         except ValueError:
             if stop - start == 1:
                 bad[start] = True
@@ -173,8 +173,8 @@ def variables(campaign: Campaign) -> dict[str, Variable]:
     """
     scenarios, inputs = drawn(campaign, 0, BLOCK)
     params, scenarios = prepared(campaign.system, campaign.params, scenarios)
-    if refused(campaign.system, params, scenarios).all():
-        validated(campaign.system, params, scenarios, BLOCK)
+    if refused(campaign.system, params, scenarios, campaign.ticks).all():
+        validated(campaign.system, params, scenarios, BLOCK, campaign.ticks)
     scores = score_shapes(campaign.system, params, scenarios, campaign.key, campaign.ticks, campaign.score)
     ok = named(scores, "score").get("ok")
     if ok is not None and (ok.dtype != bool or ok.shape != (BLOCK,)):

@@ -667,13 +667,13 @@ def score(params: Params, scenario: Scenario, now, log: Log) -> Scores:
 
 
 def refuse_bad(params: Params, scenario: Scenario) -> None:
-    """The system's check: a table that holds the start, a latency that the line holds, wheels of which any three span space."""
+    """The system's check: a table as long as the run, a latency that the line holds, wheels of which any three span space."""
     check.kinds(params, Params, scenario, Scenario)
     fits = np.isin(
         scenario.latency, np.arange(1, LATENCY + 1)
     )  # a sample of this tick would meet the clone of the last
     check.each("scenario.latency", f"be whole, from 1 to {LATENCY} ticks", scenario.latency, fits)
-    refuse_short("params.table", params.table, scenario.t0, scenario.t0)
+    refuse_short("params.table", params.table, scenario.t0, scenario.t0 + check.last_tick())
     for i in range(4):
         refuse_flat(f"params.axes without wheel {i}", params.axes, np.arange(4) != i)
 
