@@ -12,7 +12,7 @@ import jax
 
 import jaxatt
 
-NAMES = ("observer_pd", "gyro_ekf", "cmg_loss", "star_isolation", "wheel_mrac", "microsat", "campaign")
+NAMES = ("observer_pd", "gyro_ekf", "cmg_loss", "star_isolation", "wheel_mrac", "microsat", "parts", "campaign")
 
 
 def main() -> None:

@@ -15,19 +15,30 @@ import numpy as np
 
 from experiments.report import interval
 from jaxatt import Fault, on_axes, scores, simulate, sweep
-from jaxatt.attitude import quat_angle, quat_conjugate, quat_normalised, quat_rate, quat_to_body, vector_from_quat
+from jaxatt.attitude import (
+    quat_angle,
+    quat_conjugate,
+    quat_from_vector,
+    quat_normalised,
+    quat_rate,
+    quat_to_body,
+    vector_from_quat,
+)
 from jaxatt.bodies import body_acceleration, dipole_torque
 from jaxatt.contract import System
 from jaxatt.controllers import bdot, quaternion_pd, saturated
 from jaxatt.environment import at
+from jaxatt.faults import Reading
 from jaxatt.guidance import Mode, Rule, Target, first_mode, nadir, next_mode, pointed, tracking_error
 from jaxatt.loops import microsat as ms
+from jaxatt.mekf import predict, start, update_vector
 from jaxatt.orbit import MU
 from jaxatt.plot import COLOURS, GREY, LINES, MARKS
 from jaxatt.single_frame import davenport, davenport_covariance
 from jaxatt.thresholds import rate_above, tail
 from jaxatt.tuning import value_and_gradient
-from jaxatt.vec import Quat, Vec3, inverse, norm, where
+from jaxatt.usque import usque_step
+from jaxatt.vec import Quat, Vec3, inverse, norm, where, zeros
 from jaxatt.wheels import allocation, minimax
 
 DEG = np.pi / 180
@@ -151,6 +162,7 @@ def run(report) -> None:
     gradient(report)
     envelopes(report)
     single_frame(report)
+    race(report)
     modes(report)
 
 
@@ -535,6 +547,59 @@ def single_frame(report) -> None:
         f"Sun and field of one instant: rms {rms:.3g} deg, {rms / 0.005343:.3g} times that of the filter with stars"
     )
     report.check("one instant: NEES/3", 1, nees.mean() / 3, 3 * np.sqrt(2 / (3 * len(nees))), "chi-square, 3 sigma")
+
+
+def race(report) -> None:
+    """MEKF and USQUE from far off, by the magnetic field and a good gyro every ten seconds, on the same readings."""
+    n, steps, dt = 16 if report.quick else 64, 300, 10.0
+    arw, rrw, std, bias = 3.1623e-7, 3.1623e-10, 5e-8, 0.1 * DEG / 3600
+
+    def run(far, key):
+        when, axis, noise = jax.random.split(key, 3)
+        t0, axis = PERIOD * jax.random.uniform(when), jax.random.normal(axis, (3,))
+        truth = lambda orbit: nadir(orbit.r, orbit.v)
+        first = truth(at(ms.params.table, t0))
+        believed = first * quat_from_vector(Vec3(*(far / jnp.linalg.norm(axis) * axis)))
+        begin = start(believed, zeros(), far, 2 * bias)
+
+        def tick(carry, given):
+            before, b, mekf, usque = carry
+            k, normals = given
+            orbit = at(ms.params.table, t0 + dt * (k + 1))
+            q = truth(orbit)
+            turn = vector_from_quat(quat_conjugate(before) * q)
+            rate = (1 / dt) * turn + b + (arw / np.sqrt(dt)) * Vec3(*normals[:3])
+            field = Reading(quat_to_body(q, orbit.field) + std * Vec3(*normals[3:6]), jnp.asarray(True))
+            mekf = update_vector(predict(mekf, rate, dt, arw, rrw), field, orbit.field, std)[0]
+            usque = usque_step(usque, rate, dt, arw, rrw, field, orbit.field, std)[0]
+            errors = [quat_angle(quat_conjugate(belief.q) * q) for belief in (mekf, usque)]
+            return (q, b + rrw * np.sqrt(dt) * Vec3(*normals[6:]), mekf, usque), jnp.stack(errors)
+
+        carry = first, bias * Vec3(*jnp.ones(3)), begin, begin
+        return jax.lax.scan(tick, carry, (jnp.arange(steps), jax.random.normal(noise, (steps, 9))))[1]
+
+    starts = np.array([1.0, 60.0, 150.0])
+    keys = jax.random.split(jax.random.key(11), n)
+    found = jax.jit(jax.vmap(jax.vmap(run, (None, 0)), (0, None)))(starts * DEG, keys)
+    median = np.median(found, axis=1) / DEG  # (starts, steps, filters)
+    fig, ax = plt.subplots(figsize=(6.5, 4.4), layout="constrained")
+    t = dt * np.arange(1, steps + 1)
+    for i, far in enumerate(starts):
+        for kind, name in enumerate(("MEKF", "USQUE")):
+            label = f"{name}, from {far:g} deg"
+            ax.semilogy(t, median[i, :, kind], LINES[kind], color=COLOURS[i], label=label)
+    ax.set(xlabel="time [s]", ylabel=f"error of the attitude, median of {n} runs [deg]")
+    fig.legend(loc="outside upper center", ncols=3, fontsize=8)
+    report.figure("mekf_usque", fig)
+    report.note("median error after 100, 500, 1000, 3000 s [deg]")
+    for far, row in zip(starts, median):
+        for kind, name in enumerate(("MEKF", "USQUE")):
+            report.note(
+                f"from {far:3g} deg, {name:5} " + " ".join(f"{row[k - 1, kind]:9.4f}" for k in (10, 50, 100, 300))
+            )
+    ratio = median[..., 1] / median[..., 0]
+    report.within("USQUE over MEKF after 1000 s, from 60 deg", None, 0.2, ratio[1, 99], REFERENCE)
+    report.within("USQUE over MEKF after 1000 s, from 1 deg", 0.9, 1.1, ratio[0, 99], f"{REFERENCE}: equal")
 
 
 class Tumbling(NamedTuple):
