@@ -277,8 +277,9 @@ def faults(report) -> None:
         if case.unit:
             right = found & (blamed == UNITS.index(case.unit))
             wrong += int((found & ~right).sum())
-            for unit in np.array(UNITS)[blamed[found & ~right]]:
-                report.note(f"{name}: blamed first was the {unit}")
+            for unit, count in zip(UNITS, np.bincount(blamed[found & ~right], minlength=len(UNITS))):
+                if count:
+                    report.note(f"{name}: in {count} of {n} runs blamed first was the {unit}")
         median, late = np.quantile(first, (0.5, 0.95), method="inverted_cdf")
         last = [np.median(a.last[i]) / DEG for a in (with_, without)]
         peak = [np.median(a.peak[i]) / DEG for a in (with_, without)]

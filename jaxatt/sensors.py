@@ -271,7 +271,7 @@ def star_read(tracker: StarTracker, q: Quat, w: Vec3, error: Vec3) -> Reading:
 
 
 def star_error(tracker: StarTracker, faults: Vec3, t, normals, last: Vec3) -> Vec3:
-    """The small turn [rad] by which a sample is wrong, noise and faults: `Fault`s about the two cross axes and boresight.
+    """The small turn [rad] by which a sample is wrong, noise and faults (each a `Fault`) about its two cross axes and boresight.
 
     normals: three standard normal numbers; last: the error of the sample before.
     """
