@@ -338,7 +338,7 @@ def faults(report) -> None:
         )
     healthy_days = np.sort(with_.last[0]) / DEG
     ax.semilogx(healthy_days, (np.arange(n) + 1) / n, LINES[2], color=GREY, label="without a fault")
-    ax.set(xlabel="rms angle to nadir in the last minute [deg]", ylabel=f"share of {total} runs with a fault [1]")
+    ax.set(xlabel="rms angle to nadir in the last minute [deg]", ylabel="share of runs [1]")
     ax.legend(loc="lower right")
     report.figure("pointing_cdf", fig)
 
@@ -461,7 +461,7 @@ def sizes(report) -> None:
         delay_ax.plot(values[finite], middle[finite], LINES[1] + MARKS[1], color=COLOURS[1], label="median")
         for ax in (share_ax, delay_ax):
             ax.set_xscale("linear" if "wheel" in label else "log")
-        delay_ax.set(xlabel=label, yscale="log", ylabel="delay [s]")
+        delay_ax.set(xlabel=label, yscale="log", ylabel="median delay [s]")
         share_ax.set(ylabel="found within 300 s [1]", ylim=(-0.03, 1.03))
         text = "  ".join(f"{v:.3g}: {m:.3g} s" for v, m in zip(values, middle))
         report.note(f"{label}: median delay (inf: not found)  {text}")
@@ -665,14 +665,16 @@ def modes(report) -> None:
     report.check("mode at the end: nominal", 2, log["mode"][-1], 0, "by the rules")
     report.note(f"angle to nadir at the end {log['off'][-1] / DEG:.3g} deg")
     fig, axes = plt.subplots(2, 1, figsize=(8, 5), sharex=True, layout="constrained")
-    for ax, name, label in zip(axes, ("rate", "off"), ("body rate [deg/s]", "angle to nadir [deg]")):
+    for ax, name, label in zip(axes, ("rate", "off"), ("body rate [deg/s]", "angle to nadir, from 1e-4 on [deg]")):
         ax.semilogy(log["t"], np.maximum(log[name] / DEG, 1e-4), color=COLOURS[0])
         ax.fill_between(log["t"], 0, 1, where=log["lit"] < 0.5, color=GREY, alpha=0.3, linewidth=0,
                         transform=ax.get_xaxis_transform(), label="eclipse")  # fmt: skip
-        for height, when, mode in zip((0.03, 0.03, 0.12), (0, *entered), MODES):
+        for when in (0, *entered):
             ax.axvline(when, color=GREY, linestyle=":")
-            ax.text(when + 30, height, mode, transform=ax.get_xaxis_transform(), fontsize=9)
         ax.set_ylabel(label)
+    for when, mode, to in zip((0, *entered), MODES, ("left", "right", "left")):
+        axes[0].text(when, 1.03, mode, transform=axes[0].get_xaxis_transform(), ha=to, fontsize=9)
+    axes[1].set_ylim(bottom=5e-5)
     axes[0].legend()
     axes[-1].set_xlabel("time [s]")
     report.figure("modes", fig)
