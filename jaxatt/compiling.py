@@ -16,7 +16,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 from jax.core import Tracer
-from jax.extend.core import Var
+from jax.extend.core import Var, jaxpr_as_fun
 
 from jaxatt import check
 
@@ -30,17 +30,15 @@ def shared(f: Callable, *operands):
     traced_operands = [leaf for leaf in jax.tree.leaves(operands) if isinstance(leaf, Tracer)]
     if not traced_operands or jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
         return f(*operands)
-    f = jax.jit(f, inline=True)  # traced once for its shapes and its values
-    found, shapes = jax.make_jaxpr(f, return_shape=True)(*operands)
-    place = {variable: i for i, variable in enumerate(found.jaxpr.invars)}
+    program, shapes = jax.make_jaxpr(f, return_shape=True)(*operands)
+    given, results = [jnp.asarray(a) for a in jax.tree.leaves(operands)], program.jaxpr.outvars
     # tied to an operand, lest reverse mode on JAX 0.10 takes the branch apart before the operand is known
     always, _ = jax.lax.optimization_barrier((jnp.asarray(True), jax.lax.stop_gradient(traced_operands[0])))
-    out = jax.lax.cond(always, f, lambda *_: zeros(shapes), *operands)
+    out = jax.lax.cond(always, jaxpr_as_fun(program), lambda *_: jax.tree.leaves(zeros(shapes)), *given)
     # what f returns as it got it goes around the boundary, where a batch would be turned to lead and back
-    given, outvars = [jnp.asarray(a) for a in jax.tree.leaves(operands)], found.jaxpr.outvars
-    leaves, treedef = jax.tree.flatten(out)
-    kept = [given[place[v]] if isinstance(v, Var) and v in place else a for v, a in zip(outvars, leaves)]
-    return jax.tree.unflatten(treedef, kept)
+    place = {variable: i for i, variable in enumerate(program.jaxpr.invars)}
+    kept = [given[place[v]] if isinstance(v, Var) and v in place else a for v, a in zip(results, out)]
+    return jax.tree.unflatten(jax.tree.structure(shapes), kept)
 
 
 def zeros(shapes):
