@@ -147,26 +147,34 @@ def block_scores(system: System, score: Callable, ticks, params, scenarios, key,
     """
     dtype = check.float_type((params, scenarios))
     noise = partial(_block_noise, system, block_key(key, block), dtype)
+    return scores_of(system, score, BLOCK, ticks, params, scenarios, noise)
+
+
+def scores_of(system: System, score: Callable, n: int, ticks, params, scenarios, noise: Callable):
+    """Scores of n scenarios side by side under the noise given, lanes last. Pure.
+
+    ticks: as of `block_scores`; noise(c): that of chunk c, shape (CHUNK, normals, n).
+    """
 
     def tallied(now, log):
         one = lambda scenario, log: jax.tree.map(jnp.asarray, score(params, scenario, now, log))
-        return over_lanes(one, BLOCK)(scenarios, log)
+        return over_lanes(one, n)(scenarios, log)
 
     @partial(jax.jit, inline=True)  # traced once for its shapes and its values
-    def ahead(state, at, n):
-        now, state, log = step(system, params, scenarios, BLOCK, at, state, n)
+    def ahead(state, at, noise):
+        now, state, log = step(system, params, scenarios, n, at, state, noise)
         return state, tallied(now, log)
 
-    state = start(system, params, scenarios, BLOCK)
+    state = start(system, params, scenarios, n)
     instants = lambda c: times(system, params, scenarios, c * CHUNK + jnp.arange(CHUNK, dtype=np.int32))
     taken = lambda tree, i: jax.tree.map(lambda a: a[i], tree)
     shapes = jax.eval_shape(ahead, state, *taken((instants(0), noise(0)), 0))[1]
     nothing = jax.tree.map(scores.empty, shapes, is_leaf=scores.is_tally)
-    add = over_lanes(scores.add, BLOCK)
+    add = over_lanes(scores.add, n)
 
     if isinstance(ticks, int):
         fold = lambda tally, now, log: (add(tally, tallied(now, log)), None)
-        tally, _ = run(system, params, scenarios, BLOCK, ticks, CHUNK, noise, fold, nothing)
+        tally, _ = run(system, params, scenarios, n, ticks, CHUNK, noise, fold, nothing)
     else:
 
         def chunk(c, carry):
@@ -179,7 +187,7 @@ def block_scores(system: System, score: Callable, ticks, params, scenarios, key,
             return jax.lax.fori_loop(0, jnp.minimum(CHUNK, ticks - c * CHUNK), one, carry)
 
         _, tally = jax.lax.fori_loop(0, -(-ticks // CHUNK), chunk, (state, nothing))
-    return over_lanes(scores.values, BLOCK)(tally)
+    return over_lanes(scores.values, n)(tally)
 
 
 def _block_noise(system, key, dtype, c):

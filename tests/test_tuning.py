@@ -131,14 +131,14 @@ KILLED = """
 import os, signal, sys
 sys.path.insert(0, "tests")
 import conftest, test_tuning as t
-from jaxatt.tuning import search
+from jaxatt import resuming
 replaced = []
 def die_at_the_ninth(beside, path, replace=os.replace):
     replaced.append(path)
     if len(replaced) == 9:
         os.kill(os.getpid(), signal.SIGKILL)  # the ninth file is written and not yet renamed
     replace(beside, path)
-search.os.replace = die_at_the_ninth
+resuming.os.replace = die_at_the_ninth
 t.long_run(sys.argv[1])
 """
 

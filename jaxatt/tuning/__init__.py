@@ -4,7 +4,7 @@ A cost is a function (theta, key) -> scalar: theta is any pytree of numbers, and
 comes from the key. Fixed scenarios are a cost that does not draw any. What a cost is made of is in `jaxatt.soft_scores`;
 numbers that must stay positive or within bounds are tuned through `bounded`.
 
-Its modules may import: tuning, check, compiling, noise, sweeping.
+Its modules may import: tuning, check, compiling, noise, resuming, sweeping.
 """
 
 from jaxatt.tuning.bounds import Bounds, bounded

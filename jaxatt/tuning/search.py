@@ -1,12 +1,10 @@
 """The search: gradient steps by any optimizer of optax, from one start or many, over parameters or scenarios.
 
-May import: check, compiling, noise, sweeping, bounds, gradient.
+May import: check, compiling, noise, resuming, sweeping, bounds, gradient.
 """
 
 from __future__ import annotations
 
-import hashlib
-import os
 from collections.abc import Callable
 from math import gcd
 from pathlib import Path
@@ -22,6 +20,7 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxatt import check
 from jaxatt.compiling import jitted
 from jaxatt.noise import one_key
+from jaxatt.resuming import mark_of, replaced
 from jaxatt.sweeping import progress_bar
 from jaxatt.tuning.bounds import bounded, ends_of
 from jaxatt.tuning.gradient import blamed, floats, value_and_gradient
@@ -216,7 +215,8 @@ def _run(
     step = jitted(step)
     trail: list[History] = []
     if save is not None:
-        path, mark = check.place("save", save), _mark(step.lower(search, key, np.int32(0)), search, key)
+        path = check.place("save", save)
+        mark = mark_of([step.lower(search, key, np.int32(0))], (jax.random.key_data(key), search))
         search, trail = _resumed(path, mark, search, steps)
     with progress_bar(progress, steps, " steps") as bar:
         bar.update(len(trail))
@@ -239,24 +239,11 @@ def _stacked(trail: list[History]) -> History:
     return jax.tree.map(lambda *a: np.stack(a), *trail)
 
 
-def _mark(lowered, search: _Search, key) -> str:
-    """What tells one search from another: its compiled program, constants included, its start and its key."""
-    mark = hashlib.sha256(lowered.as_text().encode())
-    for leaf in (jax.random.key_data(key), *jax.tree.leaves(search)):
-        mark.update(np.asarray(leaf).tobytes())
-    return mark.hexdigest()
-
-
 def _saved(path: Path, mark: str, search: _Search, trail: list[History]) -> None:
-    """Write the search beside the file, then rename it: whenever the power fails, one whole file is there."""
+    """Write the search, one whole file whenever the power fails."""
     leaves = {f"search{i}": leaf for i, leaf in enumerate(jax.tree.leaves(search))}
     leaves |= {f"history{i}": leaf for i, leaf in enumerate(jax.tree.leaves(_stacked(trail)))}
-    beside = path.with_name(path.name + f".{os.getpid()}")
-    with beside.open("wb") as file:
-        np.savez(file, mark=np.array(mark), **leaves)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(beside, path)
+    replaced(path, dict(mark=np.array(mark), **leaves))
 
 
 def _resumed(path: Path, mark: str, search: _Search, steps: int) -> tuple[_Search, list[History]]:
