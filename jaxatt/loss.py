@@ -38,7 +38,7 @@ class Curve(NamedTuple):
 class Failures(NamedTuple):
     """Runs that failed, up to 8 of each repeat; every leaf leads with them."""
 
-    scenario: Any  # a tree of scenarios
+    scenario: Any  # a tree, every leaf (failures, ...)
     noise: Any  # (failures, ticks, system.normals) [1]
     u: Any  # (failures, normals) [1] numbers of the scenario
     score: Any  # (failures,) [unit of the score]

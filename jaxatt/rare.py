@@ -94,10 +94,10 @@ def probability(
     numbers = key, event.params, event.scenario, ticks, event.above, chains, moves
     mark = "" if path is None else mark_of(programs(event, key), numbers)
     pilot, done, looks = _resumed(path, mark, repeats)
-    bar = progress_bar(progress, 7 * (repeats + 1), " levels")
-    with bar, jax.debug_nans(False), jax.debug_infs(False):  # a NaN counts as lost
+    with progress_bar(progress, 7 * (repeats + 1), " levels") as bar:
         if pilot is None:
-            pilot = piloted(event, block_key(key, 0), partial(_advance, bar, None))
+            with jax.debug_nans(False), jax.debug_infs(False):  # a NaN counts as lost
+                pilot = piloted(event, block_key(key, 0), partial(_advance, bar, None))
             if pilot.distinct <= 2 and not (pilot.distinct == 0 and pilot.nan):
                 check.refuse("score", f"be continuous: {STEP}", f"one of {pilot.distinct} values in {event.n} runs")
             _saved(path, mark, pilot, done, looks)
@@ -106,7 +106,7 @@ def probability(
         bar.update((len(done) + 1) * levels - bar.n)
 
         def one(r: int) -> Population:
-            with jax.default_device(devices[r % len(devices)]):
+            with jax.default_device(devices[r % len(devices)]), jax.debug_nans(False), jax.debug_infs(False):
                 return populated(event, block_key(key, 1 + r), pilot, partial(_advance, bar, levels))
 
         for found in _each(one, range(len(done), repeats), len(devices)):
@@ -122,8 +122,11 @@ def _each(one: Callable, numbers: range, devices: int):
     if devices == 1:
         yield from map(one, numbers)
     else:
-        with ThreadPoolExecutor(devices) as pool:
+        pool = ThreadPoolExecutor(devices)
+        try:
             yield from pool.map(one, numbers)
+        finally:
+            pool.shutdown(cancel_futures=True)
 
 
 def _advance(bar, levels: int | None, level: int, p: float, acceptance: float) -> None:

@@ -1,5 +1,6 @@
 """Small probabilities against exact ones, the promises of `jaxatt.rare`, and what it refuses."""
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -147,6 +148,17 @@ def test_the_curve_falls_to_the_estimate_and_its_first_part_is_that_of_a_sweep(b
     seen = b < beyond.levels[0]
     spread = np.sqrt(exact * (1 - exact) * (1 / 4096 + 1 / (8 * 1280)))
     assert seen.sum() > 5 and (np.abs(plain - p)[seen] < 4 * spread[seen]).all()
+
+
+def test_a_needle_is_missed_and_the_guide_says_so():
+    def needle(params, scenario, now, log):
+        return scores.final(jnp.where(log[0] > 4, 1.0, log[1] / 5))
+
+    loss = estimate(score=needle, above=0.999999, chains=32, repeats=4)
+    exact = stats.norm.sf(4) + stats.norm.sf(5)
+    assert exact == pytest.approx(3.19579e-5, rel=1e-4) and loss.high < 0.1 * exact
+    page = (ROOT / "docs/guides/rare_events.md").read_text()
+    assert re.search(r"needle.{,400}of (\d+) estimates (\d+) missed", page, re.S)
 
 
 # the parts of the estimator
