@@ -40,7 +40,7 @@ MEETING = [
     "campaign.summary",
 ]
 # public for the modules of the house: what they get has been checked before
-HOUSE = {"sweeping": "block_log block_of block_records block_scores logged progress_bar score_shapes scored"}
+HOUSE = {"sweeping": "block_log block_of block_records block_scores logged progress_bar score_shapes scored scores_of"}
 
 
 def public(module):
