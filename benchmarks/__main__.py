@@ -12,7 +12,17 @@ import jax
 
 import jaxatt
 
-NAMES = ("observer_pd", "gyro_ekf", "cmg_loss", "star_isolation", "wheel_mrac", "microsat", "parts", "campaign")
+NAMES = (
+    "observer_pd",
+    "gyro_ekf",
+    "cmg_loss",
+    "star_isolation",
+    "wheel_mrac",
+    "microsat",
+    "attitude_filters",
+    "parts",
+    "campaign",
+)
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""Speed of the attitude filters: ``python -m benchmarks.attitude_filters [--quick] [--out FILE]``.
+"""Speed of the attitude filters: ``python -m benchmarks attitude_filters``.
 
 One tick of each, for 1024 scenarios in blocks of 128 as the engine runs them, beside a filter on arrays (6, 6) under
 `jax.vmap`, as a textbook would have it.
@@ -6,10 +6,7 @@ One tick of each, for 1024 scenarios in blocks of 128 as the engine runs them, b
 
 from __future__ import annotations
 
-import argparse
 import ctypes
-import json
-import platform
 import time
 from collections.abc import Callable
 from functools import partial
@@ -19,7 +16,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-import jaxatt
 from benchmarks.measure import c_library, cpu_ns
 from jaxatt import mekf
 from jaxatt.attitude import quat_conjugate, quat_from_vector, quat_normalised, vector_from_quat
@@ -181,7 +177,7 @@ def apart(found, other) -> float:
     return float((abs(found - other) / scale).max())
 
 
-def rows(quick: bool, only: str = ""):
+def rows(quick: bool):
     """The table: ns per scenario and tick, CPU seconds of the first call, which compiles."""
     for real in (np.float32, np.float64):
         name, seen, one = np.dtype(real).name, given(real), belief(real)
@@ -196,23 +192,20 @@ def rows(quick: bool, only: str = ""):
             "Davenport with the gap, three vectors": (with_davenport_gap, one.q),
             "TRIAD": (with_triad, one.q),
         }
-        if "C".startswith(only):
-            c = c_run(real)
-            yield {
-                "name": f"C, predict + attitude, {name}",
-                "value": cpu_ns(c, LANES * TICKS, 9),
-                "unit": "ns per tick",
-            }
-            exact = state_of(runner(with_attitude)(belief(np.float64), given(np.float64)))
-            pairs = {
-                "MEKF from C": (state_of(runner(with_attitude)(one, seen)), c()),
-                "C from float64": (c(), exact),
-            }
-            for what, (found, other) in pairs.items():
-                yield {"name": f"largest deviation of {what}, {name}", "value": apart(found, other), "unit": ""}
+        c = c_run(real)
+        yield {
+            "name": f"C, predict + attitude, {name}",
+            "value": cpu_ns(c, LANES * TICKS, 9),
+            "unit": "ns per tick",
+        }
+        exact = state_of(runner(with_attitude)(belief(np.float64), given(np.float64)))
+        pairs = {
+            "MEKF from C": (state_of(runner(with_attitude)(one, seen)), c()),
+            "C from float64": (c(), exact),
+        }
+        for what, (found, other) in pairs.items():
+            yield {"name": f"largest deviation of {what}, {name}", "value": apart(found, other), "unit": ""}
         for form, (tick, state) in ticks.items():
-            if not form.startswith(only):
-                continue
             run = partial(runner(tick), state, seen)
             before = time.process_time()
             jax.block_until_ready(run())
@@ -223,24 +216,3 @@ def rows(quick: bool, only: str = ""):
                 "unit": "ns per tick",
             }
             yield {"name": f"{form}, {name}: first call, CPU", "value": first, "unit": "s"}
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.attitude_filters", description=__doc__)
-    parser.add_argument("--only", default="", help="forms whose name begins so")
-    parser.add_argument("--quick", action="store_true", help="fewer repeats")
-    parser.add_argument("--out", type=Path, default=Path("results/attitude_filters.json"), help="table as JSON")
-    args = parser.parse_args()
-    jax.config.update("jax_enable_x64", True)
-    jaxatt.configure()
-    print(f"attitude filters (Python {platform.python_version()}, JAX {jax.__version__})")
-    found = []
-    for row in rows(args.quick, args.only):
-        found.append(row)
-        print(f"  {row['name']:62} {row['value']:>10.4g} {row['unit']}", flush=True)
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    args.out.write_text(json.dumps({"jax": jax.__version__, "rows": found}, indent=1) + "\n")
-
-
-if __name__ == "__main__":
-    main()

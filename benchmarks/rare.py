@@ -40,8 +40,8 @@ class Case(NamedTuple):
 
 
 def mirror(normals: int) -> System:
-    """A loop that logs its noise."""
-    tick = lambda params, scenario, now, x, z, noise: (x, z, noise)
+    """A loop whose log is its noise, shifted by the scenario."""
+    tick = lambda params, scenario, now, x, z, noise: (x, z, scenario + noise)
     return System(lambda params, scenario: (scenario, ()), tick, lambda p, s, t, x, z: 0 * x, 1.0, 1, normals)
 
 
@@ -50,7 +50,7 @@ def square(params, scenario, now, log):
 
 
 def scaled(params, scenario, now, log):
-    return scores.total(jnp.sum(log) / jnp.sqrt(1000.0))
+    return scores.total(params * jnp.sum(log) / jnp.sqrt(1000.0))
 
 
 def four(params, scenario, now, log):

@@ -42,10 +42,10 @@ def concrete(tree) -> bool:
     return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
-_batch: ContextVar[tuple] = ContextVar(
-    "number of scenarios that are checked, whether params are shared", default=(None, False)
+_run: ContextVar[tuple] = ContextVar(
+    "of what is checked: number of scenarios, whether params are shared, time of the last tick [s]",
+    default=(None, False, 0.0),
 )
-_end: ContextVar[float] = ContextVar("time of the last tick of the run that is checked [s]", default=0.0)
 
 
 @contextmanager
@@ -54,17 +54,16 @@ def scenarios(n: int | None, params: Any = (), end: float = 0.0):
 
     params: what is named so and shared by the scenarios; () where there is nothing. end: see `last_tick`.
     """
-    tokens = _batch.set((n, bool(jax.tree.leaves(params)))), _end.set(end)
+    token = _run.set((n, bool(jax.tree.leaves(params)), end))
     try:
         yield
     finally:
-        _batch.reset(tokens[0])
-        _end.reset(tokens[1])
+        _run.reset(token)
 
 
 def last_tick() -> float:
     """Time of the last tick [s] of the run that a loop's ``check`` is called for; 0 where no run is meant."""
-    return _end.get()
+    return _run.get()[2]
 
 
 def each(name: str, must: str, value, good) -> None:
@@ -84,7 +83,7 @@ def pair(name: str, must: str, value, other, holds) -> None:
 
 def _place_of(name: str, index: tuple, shape: tuple) -> tuple[str, str]:
     """Where in an array an index lies: the words behind the name, and those that tell the scenario."""
-    (n, shared), where = _batch.get(), ""
+    (n, shared, _), where = _run.get(), ""
     if n is not None and shape[-1:] == (n,) and not (shared and name.lstrip("|").startswith("params")):
         index, where = index[:-1], f" in scenario {index[-1]}"
     return (f"[{', '.join(map(str, index))}]" if index else ""), where

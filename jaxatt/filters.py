@@ -22,10 +22,11 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxatt import check
 from jaxatt.attitude import wrapped
-from jaxatt.batching import lanes_last
+from jaxatt.batching import lanes_last, mask
 from jaxatt.compiling import shared
 from jaxatt.faults import Reading
 
@@ -252,10 +253,5 @@ def _update(h: Callable, belief: Belief, reading: Reading, R, period, triangle=T
         return K.at[i].set(d * jax.lax.rsqrt(S[i]))
 
     gain = jnp.swapaxes(jax.lax.fori_loop(0, k, column, jnp.zeros_like(D)), 0, 1)
-    covariance = jax.lax.map(H, HP) + jnp.where(_eye(k, value), R, 0)
+    covariance = jax.lax.map(H, HP) + jnp.where(mask(np.eye(k, dtype=bool), value[0]), R, 0)
     return Belief(mean, _rows(remaining, n)), Innovation(value, covariance, nis, rows, nll, gain)
-
-
-def _eye(k: int, like):
-    """The unit matrix (k, k, ...) of bool, for as many lanes as like has."""
-    return jnp.eye(k, dtype=bool).reshape(k, k, *(1,) * (like.ndim - 1))

@@ -14,8 +14,8 @@ import toy
 from scipy import stats
 
 import jaxatt
+from benchmarks.rare import breitung, four, mirror, modes, needle, scaled, square
 from jaxatt import normal_space, rare, scores, subset
-from jaxatt.contract import System
 from jaxatt.loss import log_t, wilson
 
 ROOT = Path(__file__).parents[1]
@@ -23,53 +23,12 @@ PARAMS, SCENARIO = np.float32(1.0), np.float32(0.0)
 key = jax.random.key
 
 
-def tick(params, scenario, now, x, z, noise):
-    return x, z, scenario + noise
-
-
-def mirror(normals):
-    """A loop whose log is its noise, shifted by the scenario."""
-    return System(
-        lambda params, scenario: (scenario, ()), tick, lambda params, scenario, t, x, z: 0 * x, 1.0, 1, normals
-    )
-
-
 SIX, FEW, MANY, TEN, ONE = mirror(6), mirror(2), mirror(100), mirror(10), mirror(1)
-
-
-def square(params, scenario, now, log):
-    return scores.peak(log @ log)
-
-
-def scaled(params, scenario, now, log):
-    return scores.total(params * jnp.sum(log) / jnp.sqrt(1000.0))
-
-
-def four(params, scenario, now, log):
-    u, v = (log[0] + log[1]) / jnp.sqrt(2.0), (log[0] - log[1]) / jnp.sqrt(2.0)
-    return scores.peak(jnp.maximum(jnp.abs(v) - 0.2 * u * u, jnp.abs(u) - 0.5))
 
 
 def two(params, scenario, now, log):
     """x_1, or minus the sum of the other 99 over the root of 99."""
-    first = now.k == 0
-    rest = jnp.sum(log) - jnp.where(first, log[0], 0)
-    return TwoModes(jnp.where(first, log[0], 0.0), -rest / jnp.sqrt(99.0))
-
-
-class TwoModes(scores.Total):
-    def __add__(self, later):
-        return TwoModes(self.total + later.total, self.rest + later.rest)
-
-    def value(self):
-        return jnp.maximum(self.total, self.rest)
-
-
-def breitung(params, scenario, now, log):
-    a, b = log
-    g1 = jnp.where(a > 3.5, 4 - a, 0.85 - 0.1 * a)
-    g2 = jnp.where(b > 2, 0.5 - 0.1 * b, 2.3 - b)
-    return scores.final(-jnp.minimum(g1, g2))
+    return modes(0.0, scenario, now, log)
 
 
 def first(params, scenario, now, log):
@@ -151,9 +110,6 @@ def test_the_curve_falls_to_the_estimate_and_its_first_part_is_that_of_a_sweep(b
 
 
 def test_a_needle_is_missed_and_the_guide_says_so():
-    def needle(params, scenario, now, log):
-        return scores.final(jnp.where(log[0] > 4, 1.0, log[1] / 5))
-
     loss = estimate(score=needle, above=0.999999, chains=32, repeats=4)
     exact = stats.norm.sf(4) + stats.norm.sf(5)
     assert exact == pytest.approx(3.19579e-5, rel=1e-4) and loss.high < 0.1 * exact
