@@ -20,7 +20,7 @@ import xarray as xr
 import zarr
 
 from benchmarks import tiny_campaign as tiny
-from jaxatt import scores, simulate, sweep
+from jaxatt import noise, scores, simulate, sweep
 from jaxatt.campaign import dataset, draw, extend, rerun, run, scenarios, until, workers
 from jaxatt.campaign.draw import checked, results
 from jaxatt.campaign.provenance import environment, manifest_of
@@ -363,6 +363,10 @@ def test_another_campaign_is_refused_by_name(whole, tmp_path, monkeypatch):
         assert words in str(error.value)
     monkeypatch.setattr(jax, "__version__", "0.0.1")
     with pytest.raises(ValueError, match=r"these differ: jax is '0.0.1', but '"):
+        run(path, tiny.campaign(), N)
+    monkeypatch.undo()
+    monkeypatch.setattr(noise, "VERSION", noise.VERSION + 1)
+    with pytest.raises(ValueError, match=r"these differ: noise is \d, but \d in the store"):
         run(path, tiny.campaign(), N)
     monkeypatch.undo()
     with pytest.raises(ValueError, match=r"`n` must be the 1024 scenarios of the store \(or more, in `extend`\)"):

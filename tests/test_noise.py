@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import stats
-from scipy.special import ndtri
+from scipy.special import ndtr, ndtri
 from toy import SYSTEM
 
 from jaxatt.noise import BLOCK, _normal, block_key, chunk_noise, noise_of, one_key
@@ -49,11 +49,79 @@ def test_a_loop_without_noise_gets_an_empty_array():
     assert noise_of(SYSTEM._replace(normals=0), KEY, 3, 7).shape == (7, 0)
 
 
+def exact(word, partner):
+    """The normal number of a word and its partner in float64: the quantile of p = (m + (v + 1/2) / 2^16) / 2^32."""
+    m, v = (np.asarray(word, np.int64) & 0x7FFFFFFF), np.asarray(partner, np.int64) & 0xFFFF
+    size = -ndtri((m + (v + 0.5) / 65536) / 2.0**32)
+    return np.where(np.asarray(word, np.int64) >> 31, -size, size)
+
+
+def drawn(word, partner):
+    return np.asarray(jax.jit(_normal)(jnp.asarray(word, jnp.uint32), jnp.asarray(partner, jnp.uint32)), float)
+
+
 def test_the_normal_quantile_is_exact_to_float32_rounding_over_its_range():
-    words = jnp.concatenate([jnp.arange(200), 2**22 + jnp.arange(-100, 100), 2**23 - 1 - jnp.arange(200)])
-    words = jnp.concatenate([words, jax.random.bits(KEY, (10_000,), jnp.uint32) >> 9]).astype(jnp.uint32)
-    u = (np.asarray(words, float) + 0.5) / 2**23
-    np.testing.assert_allclose(_normal(words << 9), ndtri(u), rtol=2e-6)
+    words = np.asarray(jax.random.bits(KEY, (2, 2_000_000), jnp.uint32))
+    tails = np.stack([np.arange(4096), np.arange(4096) * 40503 % 65536])
+    for word, partner in (words, tails, tails + np.array([[2**31], [0]]), 2**31 - 1 - tails):
+        found, true = drawn(word, partner), exact(word, partner)
+        np.testing.assert_allclose(found, true, rtol=5e-7)
+
+
+@pytest.mark.parametrize(
+    ("word", "partner", "number"),
+    [
+        (0, 0, 7.86978),
+        (0, 0xFFFF, 6.230261),
+        (1, 0, 6.230258),
+        (0x40000000, 0, 0.6744897),
+        (12345, 54321, 4.535416),
+        (0x80000000, 0, -7.86978),
+    ],
+)
+def test_numbers_worked_out_by_hand(word, partner, number):
+    assert drawn(word, partner) == pytest.approx(number, abs=3e-6)
+
+
+@pytest.mark.parametrize(("beyond", "rtol"), [(5, 1e-3), (6, 1e-3), (6.5, 1e-3), (7, 2e-3)])
+def test_the_tails_hold_their_mass(beyond, rtol):
+    """Counted over all words and partners: the number falls with m + v / 2^16, so one cell holds the edge."""
+    edge = ndtr(-beyond) * 2.0**32
+    m = np.arange(int(edge) + 2)[-3:]
+    v = np.arange(65536)
+    count = int(m[0]) * 65536 + sum(int((drawn(np.full(65536, k), v) > beyond).sum()) for k in m)
+    assert count / 2.0**48 == pytest.approx(ndtr(-beyond), rel=rtol)
+
+
+def test_the_number_falls_with_its_probability():
+    m = np.repeat(np.arange(4097), 2)
+    v = np.tile([0, 65535], 4097)
+    steps = np.diff(drawn(m, v))
+    assert np.all(steps <= np.spacing(np.float32(8)))
+
+
+def test_moments_of_four_million():
+    x = drawn(*np.asarray(jax.random.bits(jax.random.key(9), (2, 4_000_000), jnp.uint32)))
+    n = len(x)
+    for power, mean, variance in ((1, 0, 1), (2, 1, 2), (4, 3, 96)):
+        assert abs(np.mean(x**power) - mean) < 4 * np.sqrt(variance / n)
+
+
+def test_partners_are_uncorrelated_where_they_share_bits():
+    """The words of one block refine each other: in the far tail, where it matters, a number tells nothing of its partner."""
+    v = np.asarray(jax.random.bits(jax.random.key(8), (400_000,), jnp.uint32))
+    for m in (0, 1, 10):
+        x, y = drawn(np.full(len(v), m), v), drawn(v, np.full(len(v), m))
+        for of in (np.positive, np.abs, np.square):
+            assert abs(np.corrcoef(x, of(y))[0, 1]) < 4 / np.sqrt(len(v))
+
+
+@pytest.mark.parametrize("normals", [1, 3])
+def test_one_run_of_few_numbers_has_tails_too(normals):
+    """A single scenario draws an odd number of words: the one too many is drawn, not left at zero."""
+    x = np.asarray(chunk_noise(SYSTEM._replace(normals=normals), one_key(KEY), jnp.asarray(0), 20_000, (), jnp.float32))
+    assert x.shape == (20_000, normals) and len(np.unique(x)) > 0.99 * x.size
+    assert stats.kstest(x.ravel(), "norm").pvalue > 1e-3
 
 
 @pytest.mark.parametrize(

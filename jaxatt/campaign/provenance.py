@@ -4,7 +4,7 @@ A campaign goes on only where all of it is the same; the message says what diffe
 compared by their names, those of a user by what they are: their code, what they capture, and the functions and numbers
 that they use. So a script may be renamed, or run and then imported.
 
-May import: check, store, draw.
+May import: check, noise, store, draw.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ import numpy as np
 import xarray as xr
 import zarr
 
-from jaxatt import check
+from jaxatt import check, noise
 from jaxatt.campaign.draw import Campaign, named
 
 
@@ -42,6 +42,7 @@ def manifest_of(campaign: Campaign, n: int) -> dict:
     loop = {f"system.{field}": _name(value) for field, value in campaign.system._asdict().items()}
     return {
         "format": 2,
+        "noise": noise.VERSION,
         "n": n,
         "key": campaign.key.tolist(),
         **{field: getattr(campaign, field) for field in ("ticks", "every", "block", "size")},
