@@ -281,6 +281,61 @@ def peak_time(now, value) -> PeakTime:
     return PeakTime(value, jnp.broadcast_to(real(now.t), value.shape))
 
 
+# yes or no as a number that can be climbed
+
+
+class Margin(NamedTuple):
+    """How far the largest value in a window stayed below a threshold; negative beyond it, NaN if it held no tick."""
+
+    least: Any = jnp.inf  # [unit of the value]
+
+    def __add__(self, later):
+        return Margin(jnp.minimum(self.least, later.least))
+
+    def value(self):
+        return jnp.where(self.least == jnp.inf, jnp.nan, self.least)
+
+
+class Crossing(NamedTuple):
+    """Time [s] at which a value first exceeds a threshold, interpolated between ticks; inf if never."""
+
+    t: Any = jnp.inf  # [s]
+    first: Any = jnp.nan  # [unit of the value] excess at the first tick
+    first_t: Any = jnp.nan  # [s] of that tick
+    last: Any = jnp.nan  # [unit of the value] excess at the last tick
+    last_t: Any = jnp.nan  # [s] of that tick
+
+    def __add__(self, later):
+        share = self.last / (self.last - jnp.where(later.first > 0, later.first, 1))  # the last excess is not positive
+        between = self.last_t + share * (later.first_t - self.last_t)
+        begun = ~jnp.isnan(self.first_t)
+        met = jnp.where((later.first > 0) & begun, between, later.t)
+        first, first_t = (jnp.where(begun, a, b) for a, b in zip(self[1:3], later[1:3]))
+        ended = ~jnp.isnan(later.last_t)
+        last, last_t = (jnp.where(ended, b, a) for a, b in zip(self[3:], later[3:]))
+        return Crossing(jnp.where(self.t < jnp.inf, self.t, met), first, first_t, last, last_t)
+
+    def value(self):
+        return self.t
+
+
+def margin(value, threshold, inside: Any = True) -> Margin:
+    """Tally how far value stays below a threshold over the ticks where ``inside`` holds: a miss is a margin above 0."""
+    return Margin(_where(inside, threshold - real(value), jnp.inf))
+
+
+def alarm_time(now, value, threshold, since: Any = 0.0) -> Crossing:
+    """Tally the time [s] from ``since`` to the first value above a threshold after it, interpolated between ticks.
+
+    Continuous where `first` moves by whole ticks, so that its tail can be climbed.
+    """
+    t = real(now.t)
+    excess = (real(value) - threshold).astype(t.dtype)
+    excess, t = jnp.broadcast_arrays(excess, t - jnp.asarray(since, t.dtype))
+    excess, t = (jnp.where(t >= 0, a, jnp.nan) for a in (excess, t))
+    return Crossing(jnp.where(excess > 0, t, jnp.inf), excess, t, excess, t)
+
+
 # what a cost that is not finite is made of
 
 listening: ContextVar[bool] = ContextVar("whether somebody asks what a cost is made of", default=False)

@@ -18,6 +18,15 @@ def total(tally_of, ticks=range(40)):
     return float(scores.values(sum_))
 
 
+def crossed(values, threshold, since):
+    """Time from tick ``since`` to where the line through the ticks' values first rises above the threshold."""
+    k = since + np.argmax(values[since:] > threshold)
+    if k == since:
+        return 0.0
+    before = values[k - 1]
+    return 0.5 * (k - 1 + (threshold - before) / (values[k] - before) - since)
+
+
 @pytest.mark.parametrize(
     ("tally_of", "expected"),
     [
@@ -39,6 +48,13 @@ def total(tally_of, ticks=range(40)):
         (lambda now, v, i: scores.total(v, i), VALUES[INSIDE].sum()),
         (lambda now, v, i: scores.peak_time(now, v), 0.5 * np.argmax(VALUES)),
         (lambda now, v, i: scores.peak_time(now, jnp.minimum(v, 1)), 0.5 * np.argmax(VALUES >= 1)),
+        (lambda now, v, i: scores.margin(v, 2.5), 2.5 - VALUES.max()),
+        (lambda now, v, i: scores.margin(v, 0.0, i), -VALUES[INSIDE].max()),
+        (lambda now, v, i: scores.alarm_time(now, v, 1.0), crossed(VALUES, 1.0, 0)),
+        (lambda now, v, i: scores.alarm_time(now, v, 0.3, 12.0), crossed(VALUES, 0.3, 24)),
+        (lambda now, v, i: scores.alarm_time(now, v, 0.5, 10.5), crossed(VALUES, 0.5, 21)),
+        (lambda now, v, i: scores.alarm_time(now, v, -9.0, 2.0), 0.0),
+        (lambda now, v, i: scores.alarm_time(now, v, 9.0), np.inf),
     ],
 )
 def test_tallies_add_up_to_the_statistics_of_the_run(tally_of, expected):
@@ -52,6 +68,8 @@ def test_empty_windows_are_nan_never_is_inf():
     assert np.isnan(total(lambda now, v, i: scores.peak(v, never)))
     assert np.isnan(total(lambda now, v, i: scores.settling(now, v > 1, never)))
     assert np.isnan(total(lambda now, v, i: scores.span(v, never)))
+    assert np.isnan(total(lambda now, v, i: scores.margin(v, 1, never)))
+    assert total(lambda now, v, i: scores.alarm_time(now, v, -9, since=99)) == np.inf
     assert total(lambda now, v, i: scores.total(v, never)) == 0
     assert total(lambda now, v, i: scores.first(now, never)) == np.inf
     assert total(lambda now, v, i: scores.settling(now, never)) == 0
@@ -122,6 +140,15 @@ def test_the_forward_derivative_of_a_long_mean_is_right_too():
     assert jax.jvp(mean, (np.float32(0.1),), (np.float32(1),))[1] == pytest.approx(1, rel=2e-7)
 
 
+def test_the_time_of_an_alarm_does_not_depend_on_how_ticks_are_put_together():
+    some = [scores.alarm_time(Now(k, 0.5 * k, 0.5), VALUES[k], 1.0) for k in range(40)]
+    empty = scores.empty(jax.tree.map(jnp.asarray, some[0]))
+    whole = scores.values(sum(some[1:], some[0]))
+    for cut in (0, 1, 7, int(np.argmax(VALUES > 1)), 39):
+        left, right = sum(some[:cut], empty), sum(some[cut:], empty)
+        assert float(scores.values(left + right)) == float(whole)
+
+
 def test_an_infinite_value_makes_an_infinite_mean():
     bad = lambda now, v: jnp.where(now.k == 7, jnp.inf, v)
     assert total(lambda now, v, i: scores.mean(bad(now, v))) == np.inf
@@ -131,12 +158,14 @@ def test_an_infinite_value_makes_an_infinite_mean():
 @pytest.mark.parametrize("value", [2, 2.0, True, np.int64(2), np.float64(2), np.array(2), np.float32(2), np.uint8(2)])
 def test_every_tally_takes_a_number_of_any_type(value):
     right = dict(mean=value, rms=2**0.5 if value is not True else 1, peak=value, final=value, span=0, total=40 * value, always=1, first=0,
-                 settling=np.inf, peak_time=0)  # fmt: skip
-    timed = {"first", "settling", "peak_time"}
+                 settling=np.inf, peak_time=0, margin=1 - int(value), alarm_time=0)  # fmt: skip
+    timed, against = {"first", "settling", "peak_time", "alarm_time"}, {"margin": (1.0,), "alarm_time": (0.5,)}
     with jax.numpy_dtype_promotion("strict"):
         for name, number in right.items():
             tally = getattr(scores, name)
-            found = total(lambda now, v, i, t=tally, n=name: t(now, value) if n in timed else t(value))
+            found = total(
+                lambda now, v, i, t=tally, n=name: t(*([now] if n in timed else []), value, *against.get(n, ()))
+            )
             assert found == pytest.approx(float(number)), name
 
 
