@@ -89,8 +89,8 @@ class Event(NamedTuple):
 
     @property
     def bytes(self) -> int:
-        """What one population takes at most: start of a level, two points of a move, two ahead, those that go on."""
-        return self.size * (6 + 2 * self.moves * self.stored)
+        """What one population takes at most: start of a level, two points of a move, two ahead, those that go on, scores."""
+        return self.size * (6 + 2 * self.moves * self.stored) + 64 * self.n
 
 
 # the two programs

@@ -5,7 +5,7 @@ so that 1e-6 takes six levels and not a hundred million runs. A pilot chooses th
 each is an unbiased estimate and their spread is the interval. `design_point` finds the nearest failure by gradient,
 `importance` samples around it.
 
-May import: check, contract, design_point, engine, loss, noise, normal_space, resuming, subset, sweeping.
+May import: check, contract, design_point, engine, loss, noise, normal_space, reliability, resuming, subset, sweeping.
 """
 
 from __future__ import annotations
@@ -23,14 +23,18 @@ from jaxatt import check
 from jaxatt.contract import System
 from jaxatt.design_point import Points, design_point, importance
 from jaxatt.engine import simulate
-from jaxatt.loss import Curve, Loss, failure, log_t, said, wilson
+from jaxatt.loss import Curve, Groups, Loss, failure, groups, log_t, said, wilson
 from jaxatt.noise import block_key
 from jaxatt.normal_space import STEP, Event, event_of, kept_failures, programs
+from jaxatt.reliability import Sensitivity, sensitivity
 from jaxatt.resuming import mark_of, replaced
 from jaxatt.subset import KEPT, Pilot, Population, piloted, populated
 from jaxatt.sweeping import progress_bar
 
-__all__ = ["Loss", "Points", "design_point", "failure", "importance", "probability"]
+__all__ = [
+    "Groups", "Loss", "Points", "Sensitivity", "design_point", "failure", "groups", "importance", "probability",
+    "sensitivity",
+]  # fmt: skip
 
 
 def probability(

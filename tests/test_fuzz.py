@@ -11,6 +11,7 @@ import jax
 import numpy as np
 import pytest
 import test_fuzz_files
+import test_fuzz_rare
 import test_fuzz_verbs
 from abuse import EXAMPLES, fuzzed, good, judged, odd, plain, tidy
 from hypothesis import given
@@ -18,7 +19,7 @@ from hypothesis import strategies as st
 from made_up import compilations, repeated
 
 import jaxatt.loops
-from jaxatt import check, plot
+from jaxatt import check, plot, rare
 from jaxatt.contract import System
 from jaxatt.engine import simulate, validated
 
@@ -30,9 +31,13 @@ KEY = jax.random.key(0)
 
 MEETING = [
     "campaign",
+    "design_point",
     "evaluation",
+    "loss",
     "plot",
     "pointing",
+    "rare",
+    "reliability",
     "replay",
     "sweeping",
     "tuning",
@@ -40,7 +45,12 @@ MEETING = [
     "campaign.summary",
 ]
 # public for the modules of the house: what they get has been checked before
-HOUSE = {"sweeping": "block_log block_of block_records block_scores logged progress_bar score_shapes scored scores_of"}
+HOUSE = {
+    "sweeping": "block_log block_of block_records block_scores logged progress_bar score_shapes scored scores_of",
+    "design_point": "sloped",
+    "loss": "log_t said wilson",
+    "reliability": "score_slopes",
+}
 
 
 def public(module):
@@ -56,6 +66,7 @@ def test_every_public_function_that_meets_data_is_abused(name):
     here = [f for module in (test_fuzz_files, test_fuzz_verbs) for f in vars(module).values()]
     abused = {inspect.unwrap(f) for f in here if inspect.isfunction(f)}
     abused |= {inspect.unwrap(getattr(plot, figure)) for figure in test_fuzz_verbs.FIGURES}
+    abused |= {getattr(rare, verb) for verb in test_fuzz_rare.VERBS}
     forgotten = {f.__name__ for f in public(importlib.import_module(f"jaxatt.{name}")) - abused}
     assert forgotten == set(HOUSE.get(name, "").split())
 

@@ -120,3 +120,14 @@ def test_the_command_runs_a_notebook_in_a_kernel_and_reports_failures(tmp_path):
     assert jaxatt.__version__ in nbformat.read(tmp_path / "out" / "good.ipynb", 4).cells[0].outputs[0].text
     unknown = subprocess.run([*command, "none"], cwd=tmp_path, env=env, capture_output=True, text=True)
     assert unknown.returncode == 2 and "`NAME` must be one of bad, good, but it is none" in unknown.stderr
+
+
+def test_rare_events(monkeypatch):
+    names = executed("rare_events", monkeypatch)
+    loss, limit = names["loss"], names["limit"]
+    assert 1e-7 < loss.p < 1e-5 and not loss.flags
+    assert np.all(np.nanmax(names["rows"][:, 0], axis=1) > limit * (1 - 1e-5))
+    assert len(names["kinds"].index) == 1
+    angle_noise = np.nanmean(names["rows"][:, 1], axis=0)
+    assert angle_noise[30:60].mean() < -0.5 and abs(angle_noise).max() < 2  # a long lean to one side, no large sample
+    assert names["tuned"].high < loss.low

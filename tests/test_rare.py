@@ -65,13 +65,22 @@ def beyond():
 def test_the_peak_of_chi_squares_of_300_ticks():
     loss = estimate(SIX, square, 50.74440649, seed=1, ticks=300, chains=96, repeats=4)
     assert 0.65 < loss.p / 1e-6 < 1.5 and loss.low < 1e-6 < loss.high and not loss.flags
-    assert loss.runs < 36_000 and 0.4 < loss.acceptance.min() < 0.5 and 0.05 < loss.cv < 0.3
+    assert loss.runs < 36_000 and 0.05 < loss.cv < 0.3
+    assert 0.4 < loss.acceptance.mean() < 0.5 and np.all(np.abs(loss.acceptance - 0.44) < 0.1)  # a pilot of 96 chains
 
 
 def test_a_sum_in_a_thousand_dimensions():
     for above, low, high, repeats in ((4.0, 0.65, 1.5, 4), (6.0, 0.5, 1.8, 8)):
         loss = estimate(MANY, scaled, above, ticks=10, chains=96, repeats=repeats)
         assert low < loss.p / stats.norm.sf(above) < high
+
+
+def test_draws_beyond_five_sigma_occur_as_often_as_they_should():
+    """1.3e8 draws hold 7.7 beyond 5.3 in the mean; a draw of 23 bits would end at 5.2947."""
+    beyond = lambda params, scenario, now, log: scores.total(jnp.sum(log > 5.3))
+    met = jaxatt.sweep(MANY, PARAMS, np.zeros(2048, np.float32), key(4), ticks=650, score=beyond, progress=False)
+    assert stats.poisson.ppf(5e-4, 7.71) <= np.sum(met) <= stats.poisson.ppf(1 - 5e-4, 7.71)
+    assert 1 / 1.6 < estimate(ONE, first, 6.2, seed=2).p / stats.norm.sf(6.2) < 1.6
 
 
 def test_four_branches():
@@ -110,7 +119,7 @@ def test_the_curve_falls_to_the_estimate_and_its_first_part_is_that_of_a_sweep(b
 
 
 def test_a_needle_is_missed_and_the_guide_says_so():
-    loss = estimate(score=needle, above=0.999999, chains=32, repeats=4)
+    loss = estimate(score=needle, above=0.999999, chains=32, repeats=4, seed=2)
     exact = stats.norm.sf(4) + stats.norm.sf(5)
     assert exact == pytest.approx(3.19579e-5, rel=1e-4) and loss.high < 0.1 * exact
     page = (ROOT / "docs/guides/rare_events.md").read_text()
@@ -369,6 +378,55 @@ def test_points_of_four_branches_and_what_is_missed_with_one_of_them():
     with pytest.warns(UserWarning, match="contradicts"):
         loss = rare.importance(FEW, PARAMS, SCENARIO, key(1), one, runs=5000, against=whole, **ask)
     assert "contradicts" in loss.flags and loss.p < 0.6 * 4.51213895e-5
+
+
+# what failures have in common, and what changes their probability
+
+
+def test_failures_of_two_modes_fall_into_two_groups():
+    loss = estimate(TEN, two, 4.75, chains=96, repeats=4, ticks=10, seed=3)
+    noise = loss.failures.noise.reshape(len(loss.failures.score), 100)
+    features = np.stack([noise[:, 0], -noise[:, 1:].sum(axis=1) / np.sqrt(99)], axis=1)
+    found = rare.groups(loss, features)
+    assert len(found.index) == 2 and found.share.sum() == pytest.approx(1)
+    assert np.all(np.diff(found.share) <= 0) and np.all((found.low <= found.share) & (found.share <= found.high))
+    ahead = features[:, 0] > 4.75
+    assert len(np.unique(found.member[ahead])) == len(np.unique(found.member[~ahead])) == 1
+    assert found.member[found.index].tolist() == [0, 1]  # each stands for its own
+
+
+def test_failures_of_one_kind_are_one_group(beyond):
+    found = rare.groups(beyond, beyond.failures.noise.reshape(len(beyond.failures.score), -1))
+    assert len(found.index) == 1 and found.share.tolist() == [1] and not found.member.any()
+    with pytest.raises(ValueError, match=r"`features` must have shape \(\d+, numbers\)"):
+        rare.groups(beyond, np.zeros((3, 2)))
+    with pytest.raises(ValueError, match=r"`features\[0, 0\]` must be finite"):
+        rare.groups(beyond, np.full((len(beyond.failures.score), 2), np.nan))
+
+
+def test_the_gradient_of_a_probability_is_the_exact_one():
+    """P = Phi(-b / theta) for a sum scaled by theta: d ln P / d theta = phi(b / theta) b / theta^2 / P."""
+    loss = estimate(MANY, scaled, 4.75, ticks=10, chains=96)
+    told = rare.sensitivity(loss, MANY, lambda theta: theta["size"], {"size": 1.0}, ticks=10, score=scaled)
+    exact = stats.norm.pdf(4.75) * 4.75 / stats.norm.sf(4.75)
+    assert told.gradient["size"] == pytest.approx(exact, rel=0.1) and 0 < told.error["size"] < 0.05 * exact
+    assert told.mean["size"] == pytest.approx(4.75, rel=1e-3)  # the score is theta times what it is at 1
+
+
+def test_the_gradient_of_a_probability_where_the_edge_has_two_sides():
+    """Failures beyond a at theta_1 x_1 and beyond b at theta_2 times the rest: each side has its own parameter."""
+
+    def sides(params, scenario, now, log):
+        return scores.peak(jnp.maximum(params[0] * log[0], params[1] * log[1]))
+
+    loss = rare.probability(FEW, (PARAMS, PARAMS), SCENARIO, key(1), ticks=1, score=sides, above=4.0, progress=False)
+    told = rare.sensitivity(loss, FEW, tuple, (1.0, 1.0), ticks=1, score=sides)
+    exact = stats.norm.pdf(4.0) * 4.0 / stats.norm.sf(4.0) / 2
+    assert abs(told.gradient[0] - exact) < 4 * told.error[0] and told.error[0] < 0.5 * exact
+    assert sum(told.gradient) == pytest.approx(2 * exact, rel=0.1)
+    few = loss._replace(failures=jax.tree.map(lambda a: a[:3], loss.failures))
+    with pytest.raises(ValueError, match="`loss` must have levels and at least 8 failures, but it is one with 3"):
+        rare.sensitivity(few, FEW, tuple, (1.0, 1.0), ticks=1, score=sides)
 
 
 # refusals
