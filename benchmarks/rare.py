@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy import stats
 
 import jaxatt
 from jaxatt import rare, scores, sweep
@@ -123,10 +124,13 @@ def cases() -> dict[str, Case]:
     shipped, day = jax.tree.map(np.float32, (observer_pd.params, day))
     sigma = np.float32(spread_of_oscillator(1500))
     excursions = (3.5, 4.258e-2), (4.0, 7.646e-3), (4.5, 1.0188e-3), (5.0, 1.0321e-4), (6.0, 4.699e-7)
+    fifty = lambda p: float(stats.chi2.isf(-np.expm1(np.log1p(-p) / 50), 3))  # that the largest of 50 exceeds with p
     peaks = (3.23e-3, 1.067e-3), (3.6e-3, 3.22e-5), (3.8e-3, 4.15e-6), (4.0e-3, 4.79e-7), (4.4e-3, 4.44e-9)
     found = {
         "chi_square_6": Case(mirror(6), one, zero, 300, square, 50.74440649, 1e-6),
         "chi_square_9": Case(mirror(6), one, zero, 300, square, 65.54834804, 1e-9),
+        "fifty_4": Case(mirror(3), one, zero, 50, square, fifty(1e-4), 1e-4, 48),
+        "fifty_6": Case(mirror(3), one, zero, 50, square, fifty(1e-6), 1e-6, 48),
         "linear_4": Case(mirror(100), one, zero, 10, scaled, 4.0, 3.16712e-5),
         "linear_6": Case(mirror(100), one, zero, 10, scaled, 6.0, 9.86588e-10),
         "four_3": Case(two, one, zero, 1, four, 3.0, 2.22279507e-3),

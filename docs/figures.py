@@ -18,7 +18,6 @@ import numpy as np
 from PIL import Image
 
 import jaxatt
-from jaxatt import rare, scores
 from jaxatt.loops import observer_pd as loop
 from jaxatt.plot import COLOURS
 
@@ -72,32 +71,6 @@ def overview():
     fig.savefig(HERE / "figures" / "overview.png", dpi=130)
 
 
-def rare_events():
-    """The exceedance curve of a peak residual, from subset simulation, and plain sampling as far as it reaches."""
-    healthy = jaxatt.on_axes(jaxatt.Fault())
-    scenario = loop.scenario._replace(star=healthy, gyro=healthy)
-    peak = lambda params, scenario, now, log: scores.peak(log.xi, now.k >= 100)
-    ask = dict(ticks=300, score=peak)
-    loss = rare.probability(loop.system, loop.params, scenario, jax.random.key(0), above=0.0044, **ask)
-    many = jax.tree.map(lambda a: np.broadcast_to(a, (20_000, *np.shape(a))), scenario)
-    values = jaxatt.sweep(loop.system, loop.params, many, jax.random.key(1), **ask)
-    print(loss)
-    words = lambda n: f"{n:,}".replace(",", " ")
-
-    fig, ax = plt.subplots(figsize=(7, 3.6), layout="constrained")
-    b, p, low, high = loss.curve
-    ax.fill_between(b, low, high, color=COLOURS[0], alpha=0.3, linewidth=0, label="95 % interval")
-    ax.semilogy(b, p, color=COLOURS[0], label=f"subset simulation, {words(loss.runs)} runs")
-    shares = np.geomspace(0.9, 2 / len(values), 14)
-    ax.semilogy(np.quantile(values, 1 - shares), shares, "o", color=COLOURS[1], markersize=4,
-                label=f"sweep, {words(len(values))} runs")  # fmt: skip
-    for x in loss.levels:
-        ax.axvline(x, color="0.8", linewidth=0.8, zorder=0)
-    ax.set(xlabel="threshold on the residual norm [MRP, rad/s]", ylabel="probability of a false alarm in 30 s")
-    ax.legend(loc="upper right", fontsize="small")
-    fig.savefig(HERE / "figures" / "rare_events.png", dpi=130)
-
-
 def shrunk(source: Path, target: Path) -> None:
     """Store as a palette PNG of at most 1400 pixels' width."""
     with Image.open(source) as image:
@@ -149,10 +122,10 @@ def check_cases() -> None:
 if __name__ == "__main__":
     check_cases()
     jaxatt.configure()
-    for draw in (overview, rare_events):
-        draw()
-        shrunk(HERE / "figures" / f"{draw.__name__}.png", HERE / "figures" / f"{draw.__name__}.png")
-    named = {name for page in HERE.glob("loops/*.md") for name in re.findall(r"figures/(\w+)\.png", page.read_text())}
+    overview()
+    shrunk(HERE / "figures" / "overview.png", HERE / "figures" / "overview.png")
+    pages = [*HERE.glob("loops/*.md"), HERE / "guides" / "rare_events.md"]
+    named = {name for page in pages for name in re.findall(r"figures/(\w+)\.png", page.read_text())}
     for name in sorted(named):
         (system,) = [p.name for p in Path(sys.argv[1]).iterdir() if p.is_dir() and name.startswith(p.name)]
         shrunk(Path(sys.argv[1]) / system / f"{name.removeprefix(system + '_')}.png", HERE / "figures" / f"{name}.png")

@@ -36,6 +36,7 @@ EXPERIMENTS = {
     "star_isolation": Experiment(70, 88, "roc"),
     "wheel_mrac": Experiment(30, 77, "loss_of_effectiveness"),
     "microsat": Experiment(90, 50, "reconfiguration"),
+    "rare_events": Experiment(60, 18, "curves"),
 }
 NAMES = tuple(EXPERIMENTS)
 STUDIES = {"tune": "experiments.tuning"}  # words that may follow the names, and where the studies lie
