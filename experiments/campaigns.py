@@ -228,7 +228,7 @@ def compared(dataset) -> str:
                     (low,), (high,) = quantile_interval(values, [0.5])
                     middle = np.quantile(values, 0.5, method="inverted_cdf")
                     told = f"{f'{name} {what}':22} {'act' if acts else 'not'} {len(values):5} {middle:9.4f}"
-                    share = rate_of(np.sum(values > KEPT), len(values))
+                    share = rate_of(int((values > KEPT).sum()), len(values))
                     lines.append(f"{told} {f'({low:.4f} to {high:.4f})':24} {share}")
     return "\n".join(lines)
 
