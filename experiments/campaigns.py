@@ -21,7 +21,8 @@ from jax.scipy.special import ndtri
 
 from jaxatt import Fault, Quat, Vec3, on_axes
 from jaxatt.campaign import Campaign, designs, extend, run
-from jaxatt.campaign.summary import describe, sensitivity
+from jaxatt.campaign.summary import describe, rate_of, sensitivity
+from jaxatt.evaluation import quantile_interval
 from jaxatt.faults import dead_where
 from jaxatt.loops import cmg_loss as cmg
 from jaxatt.loops import gyro_ekf as ekf
@@ -46,6 +47,7 @@ class Plan(NamedTuple):
     scenario: Callable  # (numbers) -> scenario
     units: Mapping[str, str]  # of the numbers drawn
     record: Callable  # (log) -> what --every records
+    tell: Callable = describe  # (dataset) -> the summary
 
 
 def between(u, low, high):
@@ -162,17 +164,20 @@ def scenario_wheel(d):
     return params, wm.scenario._replace(J_z=d["J_z"], noise=d["noise"], wheel=wheel, drive=drive)
 
 
-# microsat: one fault of any kind in any unit, on an axis or, axis 3, on all, anywhere on the orbit
+# microsat: one fault of any kind in any unit, on an axis or, axis 3, on all, anywhere on the orbit; half of the
+# computers act on their verdicts
 
 UNITS = "none", "wheel", "gyro", "star", "star tracker", "sun sensor", "magnetometer", "tachometer"
-KINDS = "bias", "drift", "noise", "dead", "stuck", "missing"  # of a wheel: share of its torque, friction, seized, twice
+KINDS = "bias", "drift", "noise", "dead", "stuck", "missing"
+WHEEL_KINDS = "weak", "worn", "seized"
+KEPT = 0.1  # [deg] pointing of the last minute within which a run is kept
 
 
 def draw_microsat(u):
     return dict(
         t0=between(u[0], 0, 5676.98), unit=one_of(u[1], len(UNITS)), kind=one_of(u[2], len(KINDS)), axis=one_of(u[3], 4),
         size=between_logs(u[4], 0.05, 1), onset=between(u[5], 100, 200), turn=ndtri(u[6:9]), bias=ndtri(u[9:12]),
-        friction=between(u[12:16], 0.9, 1.1),
+        friction=between(u[12:16], 0.9, 1.1), act=one_of(u[16], 2),
     )  # fmt: skip
 
 
@@ -198,11 +203,34 @@ def scenario_microsat(d):
         of(0, 1 - d["size"], 1.0), of(1, 1 + 9 * d["size"], 1.0), of(2, 1.0, 0.0),
     )  # fmt: skip
     return micro.scenario._replace(
-        t0=d["t0"], friction=d["friction"], wheel=wheel, tacho=fault("tachometer", 1e-3, this),
+        t0=d["t0"], act=d["act"], friction=d["friction"], wheel=wheel, tacho=fault("tachometer", 1e-3, this),
         turn=micro.params.sigma_turn * Vec3(*d["turn"]), bias=micro.params.sigma_bias * Vec3(*d["bias"]),
         gyro=triad("gyro", 0.1 * DEG), star=triad("star", 1 * DEG), box=fault("star tracker", 0.0),
         sun=triad("sun sensor", 0.1), field=triad("magnetometer", 5e-6),
     )  # fmt: skip
+
+
+def compared(dataset) -> str:
+    """`describe`, and the pointing of the last minute of microsat's runs, fault by fault, with and without reconfiguration."""
+    unit, kind, act = (dataset[name].values for name in ("unit", "kind", "act"))
+    last = np.where(dataset.status.values == 0, dataset["last"].values / DEG, np.inf)
+    lines = [
+        describe(dataset), "",
+        f"with (act) and without reconfiguration: runs; last minute [deg], median; share of runs above {KEPT:g} deg; 95 %",
+    ]  # fmt: skip
+    for i, name in enumerate(UNITS):
+        kinds = {"none": ("",), "wheel": WHEEL_KINDS}.get(name, KINDS)
+        for j, what in enumerate(kinds):
+            here = (unit == i) & (kind % len(kinds) == j)
+            for acts in (1, 0):
+                values = last[here & (act == acts)]
+                if len(values):
+                    (low,), (high,) = quantile_interval(values, [0.5])
+                    middle = np.quantile(values, 0.5, method="inverted_cdf")
+                    told = f"{f'{name} {what}':22} {'act' if acts else 'not'} {len(values):5} {middle:9.4f}"
+                    share = rate_of(int((values > KEPT).sum()), len(values))
+                    lines.append(f"{told} {f'({low:.4f} to {high:.4f})':24} {share}")
+    return "\n".join(lines)
 
 
 PLANS = {
@@ -228,9 +256,9 @@ PLANS = {
         lambda log: dict(error=log.error),
     ),
     "microsat": Plan(
-        micro.system, micro.params, micro.score, 5000, 16, draw_microsat, scenario_microsat,
+        micro.system, micro.params, micro.score, 5000, 17, draw_microsat, scenario_microsat,
         dict(t0="s", size="1", onset="s", turn="sigma", bias="sigma", friction="1"),
-        lambda log: dict(pointing=log.pointing),
+        lambda log: dict(pointing=log.pointing), compared,
     ),
 }  # fmt: skip
 
@@ -303,7 +331,7 @@ def main(name: str, words: list[str]) -> int:
     except (ValueError, RuntimeError, OSError) as error:
         print(f"{error}\nevery block written is kept. To go on: {again}", file=sys.stderr)
         return 1
-    text = describe(dataset)
+    text = PLANS[name].tell(dataset)
     print(f"{text}\n{dataset.sizes['scenario']} of {n} scenarios in {path}, {time.perf_counter() - started:.0f} s")
     if dataset.sizes["scenario"] == n:
         (out / "summary.txt").write_text(text + "\n")

@@ -1,6 +1,6 @@
 """What tests share: scores of a log that no loop has written, equal scenarios, the count of compilations."""
 
-from functools import reduce
+from functools import cache, reduce
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +25,17 @@ def tallied(score, params, scenario, log, dt):
 def repeated(tree, n):
     """n equal scenarios, every leaf (n, ...)."""
     return jax.tree.map(lambda a: np.broadcast_to(np.asarray(a), (n, *np.shape(a))), tree)
+
+
+@cache
+def scores_and_last(score):
+    """A loop's scores and its last log: one program for all tests that sweep the loop."""
+    return lambda params, scenario, now, log: (score(params, scenario, now, log), jax.tree.map(scores.final, log))
+
+
+def wide(scenario):
+    """A satellite's wheel faults as four numbers, so that one program runs whatever fails."""
+    return scenario._replace(wheel=jax.tree.map(lambda a: np.broadcast_to(np.asarray(a, float), (4,)), scenario.wheel))
 
 
 def left(p):

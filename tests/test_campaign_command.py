@@ -1,6 +1,7 @@
 import jax
 import numpy as np
 import pytest
+import xarray as xr
 
 from benchmarks import tiny_campaign as tiny
 from experiments import campaigns
@@ -82,3 +83,18 @@ def test_every_experiment_draws_scenarios_that_its_loop_accepts(name):
     assert set(this.units) <= set(inputs)
     for values in jax.tree.leaves(inputs):
         assert np.isfinite(values).all() and (np.ptp(values, axis=0) > 0).all()
+
+
+def test_the_summary_of_microsat_compares_runs_with_and_without_reconfiguration():
+    at = lambda unit, kind: (campaigns.UNITS.index(unit), kind)
+    fault = np.repeat([at("none", 4), at("wheel", 5), at("gyro", campaigns.KINDS.index("dead"))], 20, axis=0)
+    act = np.tile([0.0, 1.0], 30)
+    degrees = np.where((fault[:, 0] == 2) & (act == 0), 90.0, 0.02)
+    status = (np.arange(60) == 59).astype(np.int8)  # the last run failed: it is not kept
+    columns = dict(unit=fault[:, 0], kind=fault[:, 1], act=act, last=np.deg2rad(degrees), status=status)
+    made = xr.Dataset({k: ("scenario", v) for k, v in columns.items()}, {"scenario": np.arange(60)})
+    told = [" ".join(line.split()) for line in campaigns.compared(made).splitlines()[-6:]]
+    assert told[0] == "none act 10 0.0200 (0.0200 to 0.0200) 0 (0 to 0.3085)"
+    assert [line.split(" 10 ")[0] for line in told[1:4]] == ["none not", "wheel seized act", "wheel seized not"]
+    assert told[4] == "gyro dead act 10 0.0200 (0.0200 to 0.0200) 0.1 (0.002529 to 0.445)"
+    assert told[5] == "gyro dead not 10 90.0000 (90.0000 to 90.0000) 1 (0.6915 to 1)"

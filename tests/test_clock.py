@@ -92,7 +92,7 @@ def test_the_gradient_of_an_instant_is_one():
 
 
 @pytest.mark.parametrize("real", REAL)
-@pytest.mark.parametrize("dt", [0.01, 0.1, 0.3, 0.005, 1 / 3])
+@pytest.mark.parametrize("dt", [0.01, 0.3, 1 / 3])
 def test_every_tenth_of_a_second_starts_at_its_tick_and_lasts_its_ticks(dt, real):
     tenths = np.arange(600)
     onset, end = tenths * 0.1, tenths * 0.1 + 0.7  # as a user works them out

@@ -552,40 +552,47 @@ def test_nees_is_the_squared_error_of_attitude_and_bias():
         assert float(mekf.mekf_nees(belief, q, BELIEF.b + Vec3(*db))) == pytest.approx(want, rel=1e-10)
 
 
-def total(x, missing):
-    """Sum of NIS over ten ticks of attitudes and vectors, as the numbers of tuning, arw, rrw and std, see it."""
+def total(x, missing, gate):
+    """Sum of NIS over ten ticks of attitudes and vectors, as arw, rrw, std and the two sigmas of a restart see it."""
     rates, y, _, references = story(4)
-    (arw, rrw, std), dtype = x, x.dtype
+    (arw, rrw, std, *sigmas), dtype = x, x.dtype
     kind = lambda a: jnp.asarray(a[:10], dtype)
     belief = jax.tree.map(lambda a: jnp.asarray(a, dtype), mekf.cloned(mekf.start(BELIEF.q, BELIEF.b, 0.05, 0.01)))
     axes, R = jax.tree.map(lambda a: jnp.asarray(a, dtype), (Mat3.of(AXES.tolist()), Vec3(1.0, 1.0, 1.0)))
 
-    def one(belief, arw, rrw, std, rate, y, reference, k):
+    def one(belief, arw, rrw, std, sigmas, rate, y, reference, k):
         belief = mekf.predict(belief, Vec3(*rate), DT, arw, rrw)
+        belief = mekf.restarted(belief, k == 4, zeros(), *sigmas)
         gone = missing & (k % 3 == 1)
         hole = jnp.where(gone, jnp.nan, 0).astype(dtype)
         sample = BELIEF.q * quat_from_vector(Vec3(*y))
         sample = Quat(*(jnp.asarray(a, dtype) + hole for a in sample))
-        belief, first = mekf.update_attitude(belief, Reading(sample, True), axes, (std * std) * R, late=True)
-        belief, second = mekf.update_vector(belief, Reading(Vec3(*(y + hole)), ~gone), Vec3(*reference), std)
-        return mekf.cloned(belief), first.nis + second.nis
+        star = Reading(sample, True)
+        belief, first = mekf.update_attitude(belief, star, axes, (std * std) * R, late=True, gate=gate)
+        seen = Reading(Vec3(*(y + hole)), ~gone)
+        belief, second = mekf.update_vector(belief, seen, Vec3(*reference), std, gate=gate)
+        return mekf.cloned(belief, when=k % 2 == 0), jnp.stack([first.nis, second.nis])
 
-    tick = lambda belief, now: alone(one, belief, arw, rrw, std, *now)
+    tick = lambda belief, now: alone(one, belief, arw, rrw, std, sigmas, *now)
     operands = kind(rates), kind(y), kind(references), jnp.arange(10)
-    return jnp.sum(jax.lax.scan(tick, belief, operands)[1])
+    nis = jax.lax.scan(tick, belief, operands)[1]
+    return jnp.sum(nis), nis
 
 
-slopes = jax.jit(jax.value_and_grad(total))
+slopes = jax.jit(jax.value_and_grad(total, has_aux=True))
 
 
-@pytest.mark.parametrize("missing", [False, True])
-def test_gradients_of_nis_are_those_of_central_differences(missing):
-    at = np.array([ARW, RRW, 0.05])
-    got = slopes(at, missing)[1]
-    for i in range(3):
-        h = 1e-5 * at * (np.arange(3) == i)
-        numeric = (slopes(at + h, missing)[0] - slopes(at - h, missing)[0]) / (2 * h[i])
-        assert float(got[i]) == pytest.approx(float(numeric), rel=1e-6)
+@pytest.mark.parametrize("missing, gate", [(False, np.inf), (True, np.inf), (False, 150.0)])
+def test_gradients_of_nis_are_those_of_central_differences(missing, gate):
+    """Through a restart, clones at every other tick, readings that are missing, and a gate that keeps some out."""
+    at = np.array([ARW, RRW, 0.05, 0.1, 0.02])
+    (_, nis), got = slopes(at, missing, gate)
+    assert gate == np.inf or 0.2 < np.mean(nis > gate) < 0.8
+    for i in range(len(at)):
+        h = 1e-3 * at * (np.arange(len(at)) == i)  # the sum is of thousands, of which rrw moves a hundredth
+        move = lambda by, h=h: float(slopes(at + by * h, missing, gate)[0][0])
+        numeric = (8 * (move(1) - move(-1)) - (move(2) - move(-2))) / (12 * h[i])
+        assert float(got[i]) == pytest.approx(numeric, rel=1e-6) != 0
 
 
 def test_gradients_of_a_step_are_finite_at_rest_and_at_the_series_edge():

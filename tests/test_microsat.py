@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from made_up import repeated
+from made_up import repeated, scores_and_last, wide
 
 from benchmarks.microsat import batched
 from jaxatt.attitude import quat_from_vector, quat_rotate
@@ -25,9 +25,7 @@ KEY = jax.random.key(3)
 ONSET = 20.0
 
 
-def wide(scenario):
-    """Wheel faults as four numbers, so that every test runs one program."""
-    return scenario._replace(wheel=jax.tree.map(lambda a: np.broadcast_to(np.asarray(a, float), (4,)), scenario.wheel))
+SCORE = scores_and_last(ms.score)  # the program of test_loops
 
 
 def first_wheel(**what):
@@ -57,10 +55,10 @@ T0 = 350.0 * np.arange(16)  # [s] along the orbit, its shadow included
 def found():
     """Scores of every fault on sixteen noises, acting and not: (2, faults, 16)."""
     one = [wide(ms.scenario._replace(**fault)) for fault in FAULTS]
-    stacked = jax.tree.map(lambda *a: np.repeat(np.stack([np.asarray(x, float) for x in a]), 16, axis=0), *one)
+    stacked = jax.tree.map(lambda *a: np.repeat(np.stack([np.asarray(x) for x in a]), 16, axis=0), *one)
     stacked = stacked._replace(t0=T0[np.arange(len(FAULTS) * 16) % 16])
     runs = [
-        sweep(ms.system, PARAMS, stacked._replace(act=np.full(len(stacked.t0), act)), KEY, ticks=TICKS, score=ms.score)
+        sweep(ms.system, PARAMS, stacked._replace(act=np.full(len(stacked.t0), act)), KEY, ticks=TICKS, score=SCORE)[0]
         for act in (1.0, 0.0)
     ]
     return jax.tree.map(lambda *a: np.stack(a).reshape(2, len(FAULTS), 16, *a[0].shape[1:]), *runs)
@@ -168,8 +166,8 @@ def test_momentum_of_body_and_wheels_is_conserved_without_outer_torque():
 
 def test_a_late_sample_updates_the_attitude_of_its_exposure():
     """With a latency of one tick the filter is as good as with two: it knows when the sample was taken."""
-    scenarios = repeated(wide(ms.scenario), 128)._replace(latency=np.repeat([1.0, 2.0], 64))
-    found = sweep(ms.system, ms.params, scenarios, KEY, ticks=TICKS, score=ms.score)
+    scenarios = repeated(wide(ms.scenario), 128)._replace(latency=np.repeat([1, 2], 64))
+    found = sweep(ms.system, ms.params, scenarios, KEY, ticks=TICKS, score=SCORE)[0]
     nees = found.nees.reshape(2, 64).mean(1)
     assert (abs(nees - 1) < 4 * np.sqrt(2 / (6 * 64))).all(), nees
 

@@ -51,6 +51,7 @@ def test_first_steps(monkeypatch):
     assert (names["swept"].miss[below] > 0.98).all() and (names["swept"].miss[above] < 0.01).all()
 
 
+@pytest.mark.short
 def test_sweep(monkeypatch):
     names = executed("sweep", monkeypatch)
     size, tau, seen = names["size"], names["tau"], names["seen"]
@@ -59,6 +60,7 @@ def test_sweep(monkeypatch):
     assert names["swept"]["ok"].all() and not seen[names["index"]]
 
 
+@pytest.mark.short
 def test_tuning(monkeypatch):
     names = executed("tuning", monkeypatch)
     assert names["history"].cost.min() < names["history"].cost[0]
@@ -76,12 +78,14 @@ def test_own_spacecraft(monkeypatch):
     )  # rad, of the slew
 
 
+@pytest.mark.short
 def test_singular_surfaces(monkeypatch):
     names = executed("singular_surfaces", monkeypatch)
     assert names["found"].condition[0] == pytest.approx(14.04, abs=0.01)
     assert names["found"].condition[0] < names["start"]
 
 
+@pytest.mark.short
 def test_recorded_data_finds_the_hidden_fault(monkeypatch):
     names = executed("recorded_data", monkeypatch)
     who, onset, size = telemetry.truth()
@@ -92,6 +96,7 @@ def test_recorded_data_finds_the_hidden_fault(monkeypatch):
     assert names["jump"] == pytest.approx(size, rel=0.05)
 
 
+@pytest.mark.short
 def test_the_recorded_data_are_what_the_simulator_gives():
     columns = telemetry.recorded()
     units = {name.split(" [")[0]: name.split("[")[1][:-1] for name in columns}
