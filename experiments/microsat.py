@@ -56,7 +56,7 @@ WIDE = ms.scenario._replace(**{
     for name in ("wheel", "tacho")
 })  # fmt: skip
 AT_ALARM = ms.params._replace(
-    limits=ms.params.limits._replace(grace=0.0, moved=0.0)
+    limits=ms.params.limits._replace(grace=0.0, moved=0.0, arbiter=0.0)
 )  # as the reference leaves wheels out
 
 

@@ -36,7 +36,7 @@ class Sensitivity(NamedTuple):
     gradient: Any  # a tree like theta [1 / unit of theta]
     error: Any  # likewise: standard error, by the repeats; that of ``slope`` is left out
     slope: float  # [1 / unit of the score] -d ln P / db at the threshold
-    mean: Any  # a tree like theta: mean gradient of the score on the edge
+    mean: Any  # likewise [unit of the score / unit of theta]: mean gradient of the score on the edge
 
 
 def sensitivity(loss: Loss, system: System, params_of: Callable, theta, *, ticks: int, score: Callable) -> Sensitivity:

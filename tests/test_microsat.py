@@ -185,18 +185,33 @@ def begun(turn):
 
 
 @jax.jit
-def judged(computer, cross, witness):
-    params = ms.params._replace(limits=ms.params.limits._replace(witness=witness))
-    return ms.judge(params, ms_now(200), computer, ms.Sample(jnp.asarray(True), jnp.asarray(3.0), cross)).verdict
+def judged(computer, witness, arbiter, cross, sun, field):
+    params = ms.params._replace(limits=ms.params.limits._replace(witness=witness, arbiter=arbiter))
+    return ms.judge(
+        params, ms_now(200), computer, ms.Sample(jnp.asarray(True), jnp.asarray(3.0), cross, sun, field)
+    ).verdict
 
 
-def verdict(rejected=0.0, guilty=np.inf, nis=3.0, cross=0.0, gyro_out=False, witness=1.0):
-    """Who is blamed, (star, gyro), from what the detectors say."""
+def verdict(
+    rejected=0.0,
+    guilty=np.inf,
+    nis=3.0,
+    cross=0.0,
+    gyro_out=False,
+    witness=1.0,
+    arbiter=1.0,
+    sun=2.0,
+    field=2.0,
+    odd=(0, 0),
+):
+    """Who is blamed, in words, from what the detectors say."""
     computer, _ = started()
     computer = computer._replace(rejected=jnp.asarray(rejected), guilty=jnp.asarray(guilty), nis=jnp.full(20, nis))
-    computer = computer._replace(verdict=computer.verdict._replace(gyro_out=jnp.asarray(gyro_out)))
-    out = judged(computer, cross, witness)
-    return bool(out.star_out), bool(out.gyro_out)
+    computer = computer._replace(
+        verdict=computer.verdict._replace(gyro_out=jnp.asarray(gyro_out)), odd=jnp.asarray(odd, float)
+    )
+    out = judged(computer, witness, arbiter, cross, sun, field)
+    return " ".join(unit for unit in ("star", "gyro", "sun", "field") if getattr(out, f"{unit}_out"))
 
 
 def ms_now(k):
@@ -204,21 +219,31 @@ def ms_now(k):
 
 
 @pytest.mark.parametrize(
-    "said, star, gyro",
+    "said, blamed",
     [
-        ({}, False, False),
-        (dict(cross=1.5), True, False),  # the sample disagrees with Sun and field
-        (dict(rejected=4.0), False, False),  # strange, but nobody is guilty yet
-        (dict(rejected=4.0, guilty=10.0), False, True),
-        (dict(rejected=8.0), True, False),  # by elimination
-        (dict(nis=8.0), True, False),
-        (dict(nis=8.0, guilty=10.0), False, True),
-        (dict(rejected=4.0, witness=0.0), False, True),  # the first logic blames the gyro
-        (dict(cross=1.5, gyro_out=True), True, False),  # the gyro was blamed for what the star tracker did
+        ({}, ""),
+        (dict(cross=1.5), "star"),  # the sample disagrees with Sun and field
+        (dict(rejected=4.0), ""),  # strange, but nobody is guilty yet
+        (dict(rejected=4.0, guilty=10.0), "gyro"),
+        (dict(rejected=8.0), "star"),  # by elimination
+        (dict(nis=8.0), "star"),
+        (dict(nis=8.0, guilty=10.0), "gyro"),
+        (dict(rejected=4.0, witness=0.0), "gyro"),  # the first logic blames the gyro
+        (dict(cross=1.5, gyro_out=True), "star"),  # the gyro was blamed for what the star tracker did
+        (dict(cross=1.5, field=0.5), ""),  # the Sun alone disagrees: not yet for long
+        (dict(cross=1.5, field=0.5, odd=(19, 0)), "sun"),
+        (dict(cross=1.5, sun=0.5, odd=(0, 19)), "field"),
+        (dict(cross=1.5, sun=0.5, odd=(19, 0)), ""),  # the other one began to disagree
+        (dict(cross=1.5, field=0.5, rejected=4.0), "star"),  # strange innovations: the star tracker has jumped
+        (dict(cross=1.5, field=0.5, guilty=10.0), "star"),  # the filter's bias has followed it
+        (dict(cross=1.5, sun=0.5, guilty=10.0, odd=(0, 19)), "field"),  # torquers in a wrong field
+        (dict(cross=1.5, sun=np.inf, field=2.0), ""),  # one against one, in the Earth's shadow: wait
+        (dict(cross=1.5, sun=np.inf, field=2.0, rejected=4.0), "star"),
+        (dict(cross=1.5, field=0.5, arbiter=0.0), "star"),  # the first logic blames the star tracker
     ],
 )
-def test_verdicts(said, star, gyro):
-    assert verdict(**said) == (star, gyro)
+def test_verdicts(said, blamed):
+    assert verdict(**said) == blamed
 
 
 @pytest.mark.parametrize("latency", [3.0, 1.5, 0.5])

@@ -59,6 +59,9 @@ INERTIA = Mat3(
 CROSS = np.array(  # threshold_quantile(1e-8, (3, 6, ... 24))
     [40.129999, 48.362628, 55.449105, 61.934232, 68.029305, 73.84389, 79.443807, 84.872378]
 )
+CLEAN = np.array([16.266236, 22.457744, 27.877165, 32.90949])  # threshold_quantile(1e-3, (3, 6, 9, 12))
+SHARE = 1 / 120  # of a new residual in the means of Sun and field: 30 s of samples
+LEAN = 16.266236 * SHARE / (2 - SHARE)  # threshold_quantile(1e-3, 3) of such a mean of white residuals
 NULL = np.array([0.5, -0.5, 0.5, -0.5])  # wheel momenta without a resultant
 TRACKER = StarTracker(
     boresight=Vec3(0.0, 1.0, 0.0), across=Vec3(0.0, 0.0, 1.0),
@@ -104,6 +107,13 @@ class Limits(NamedTuple):
     gyro: Annotated[Any, "1", limit] = 12.0  # its threshold
     memory: Annotated[Any, "s", not_negative] = 30.0  # how long the gyro stays guilty
     witness: Annotated[Any, "1", flag] = 1.0  # 0: the wheels' momentum is not asked, as in the first logic (choice 6)
+    arbiter: Annotated[Any, "1", flag] = (
+        1.0  # 0: any disagreement is the star tracker's, as in the first logic (choice 10)
+    )
+    patience: Annotated[Any, "s", positive] = 5.0  # without a star sample before Sun and field take its place
+    odd: Annotated[Any, "1", positive] = (
+        20.0  # samples for which one of Sun and field disagrees alone before it is left out
+    )
 
 
 class Params(NamedTuple):
@@ -220,6 +230,8 @@ class Verdict(NamedTuple):
     in_use: Any  # (4,) 1 for a wheel in the allocation
     star_out: Any  # bool
     gyro_out: Any  # bool
+    sun_out: Any  # bool
+    field_out: Any  # bool
     fault: Any  # bool: no attitude is left that could be trusted; the mode machine goes to safe mode
 
 
@@ -237,13 +249,17 @@ class Computer(NamedTuple):
     guilty: Any  # [ticks] since that CUSUM was last above its threshold
     rejected: Any  # [1] persistence of rejected star samples
     nis: Any  # (20,) last NIS of star samples, newest first
-    cross: Any  # (4,) last cross-checks, newest first
-    dof: Any  # (4,) their degrees of freedom
+    sun: Any  # (4,) last cross-checks of star sample and Sun, newest first, 0 where there was none
+    field: Any  # (4,) likewise of star sample and magnetic field
+    dof: Any  # (4, 2) degrees of freedom of both
+    lean: tuple  # means of the residuals of Sun and field, two `Vec3`, each over its standard deviation
+    silent: Any  # [ticks] since the last star sample
+    odd: Any  # (2,) samples for which the Sun, or the field, has disagreed alone
     verdict: Verdict
     reference: Any  # (4,) [N m s] of the wheels' drive
     torque: Any  # (4,) [N m] commanded
     tacho: Any  # (4,) [N m s] last, or what was expected instead
-    field: Vec3  # [T] last of the magnetometer, once a second
+    magnetic: Vec3  # [T] last of the magnetometer, once a second
     moment: Vec3  # [A m^2] commanded
 
 
@@ -295,6 +311,8 @@ class Log(NamedTuple):
     in_use: Annotated[Any, "1"]  # (4,) on board
     star_out: Annotated[Any, "1"]  # bool, on board
     gyro_out: Annotated[Any, "1"]  # bool, on board
+    sun_out: Annotated[Any, "1"]  # bool, on board
+    field_out: Annotated[Any, "1"]  # bool, on board
     fault: Annotated[Any, "1"]  # bool, on board
     torque: Annotated[Any, "N m"]  # (4,) commanded of the wheels, on board
     moment: Annotated[Vec3, "A m^2"]  # commanded of the torquers, on board
@@ -318,10 +336,11 @@ def init(params: Params, scenario: Scenario):
     sun, seen = Reading(quat_to_body(q, orbit.sun), no), Reading(field, no)
     arrived = Exposure(Reading(q, no), sun, seen, Sky(orbit.sun, orbit.lit, orbit.field))
     readings = Readings(Reading(w, no), arrived, sun, seen, Reading(tacho, jnp.zeros(4, bool)), orbit)
-    verdict = Verdict(jnp.zeros(4, bool), jnp.ones(4), no, no, no)
+    verdict = Verdict(jnp.zeros(4, bool), jnp.ones(4), no, no, no, no, no)
     computer = Computer(
         belief, jnp.asarray(scenario.act > 0), w, zeros(), Cusum(four, four), four, four, Cusum(zeros(), zeros()), jnp.asarray(np.inf), jnp.asarray(0.0),
-        jnp.full(NIS_WINDOW, 3.0), jnp.zeros(CROSS_WINDOW), jnp.full(CROSS_WINDOW, 6.0), verdict, scenario.h, four,
+        jnp.full(NIS_WINDOW, 3.0), jnp.zeros(CROSS_WINDOW), jnp.zeros(CROSS_WINDOW), jnp.full((CROSS_WINDOW, 2), 3.0),
+        (zeros(), zeros()), jnp.asarray(0.0), jnp.zeros(2), verdict, scenario.h, four,
         scenario.h, field, zeros(),
     )  # fmt: skip
     gyro = GyroState(scenario.bias, zeros())
@@ -417,8 +436,9 @@ def decide(params: Params, now, computer: Computer, y: Readings) -> tuple[Comput
     belief = backup(params, now, computer, y)
     computer = computer._replace(belief=cloned(belief, when=due(now.k, *STAR)))
     computer, wheel = shared(partial(wheel_residual, params, now), computer, y)
-    field = known(y.field, computer.field)
-    computer = computer._replace(field=where(now.k % SECOND == 0, field, computer.field))
+    seen = y.field._replace(valid=y.field.valid & ~acted_on(computer).field_out)
+    magnetic = known(seen, quat_to_body(belief.q, y.orbit.field))
+    computer = computer._replace(magnetic=where(now.k % SECOND == 0, magnetic, computer.magnetic))
     reference, torque, moment = shared(partial(command, params, now), computer, y)
     nis_sum = jnp.sum(computer.nis, axis=0)
     told = Statistics(wheel, gyro, star.nis, star.arrived, nis_sum, computer.rejected, star.cross)
@@ -429,7 +449,8 @@ def acted_on(computer: Computer) -> Verdict:
     """The verdict, or that nothing is out where the computer does not act."""
     verdict, act = computer.verdict, computer.act
     in_use = jnp.where(act, verdict.in_use, 1.0)
-    return Verdict(verdict.suspect, in_use, verdict.star_out & act, verdict.gyro_out & act, verdict.fault)
+    star, gyro, sun, field = (out & act for out in verdict[2:6])
+    return Verdict(verdict.suspect, in_use, star, gyro, sun, field, verdict.fault)
 
 
 def momentum_rate(params: Params, now, computer: Computer, y: Readings) -> tuple[Computer, Readings, Any]:
@@ -439,7 +460,7 @@ def momentum_rate(params: Params, now, computer: Computer, y: Readings) -> tuple
     missing reading of the gyro is replaced by it.
     """
     w, axes = computer.w, params.axes
-    torque = dipole_torque(computer.moment, computer.field) - cross(w, params.J @ w + times(axes, y.tacho.value))
+    torque = dipole_torque(computer.moment, computer.magnetic) - cross(w, params.J @ w + times(axes, y.tacho.value))
     change = inverse(params.J) @ (now.dt * torque - times(axes, y.tacho.value - computer.tacho))
     w = where(now.k > 0, w + change, w)
     there, rate = present(y.gyro), known(y.gyro, w + computer.belief.b)
@@ -448,7 +469,7 @@ def momentum_rate(params: Params, now, computer: Computer, y: Readings) -> tuple
     sums = [cusum(Cusum(*s), a / std, params.limits.gyro_slack, there) for s, a in zip(zip(*computer.gyro), apart)]
     states = Cusum(*(Vec3(*side) for side in zip(*(state for state, _ in sums))))
     statistic = jnp.max(jnp.stack([value for _, value in sums]), axis=0)
-    guilty = jnp.where(there & (statistic > params.limits.gyro), 0.0, computer.guilty + 1)
+    guilty = jnp.where(~there | (statistic > params.limits.gyro), 0.0, computer.guilty + 1)  # silence is guilt
     w = where(acted_on(computer).gyro_out, w, w + params.pull * apart)
     return computer._replace(w=w, gyro=states, guilty=guilty), y._replace(gyro=Reading(rate, there)), statistic
 
@@ -459,6 +480,8 @@ class Sample(NamedTuple):
     arrived: Any  # bool
     nis: Any  # [1]
     cross: Any  # [1] the cross-check over its threshold
+    sun: Any = np.inf  # [1] its part that is the Sun's over what is clean; inf where the Sun was not seen
+    field: Any = np.inf  # [1] likewise of the field
 
 
 def star_sample(params: Params, computer: Computer, arrived: Exposure) -> tuple[Computer, Sample]:
@@ -474,17 +497,30 @@ def star_sample(params: Params, computer: Computer, arrived: Exposure) -> tuple[
     rejected = persistence(computer.rejected, met.nis > limits.gate, MOST, came)
 
     q, sky = where(came, arrived.star.value, Quat(1.0, 0.0, 0.0, 0.0)), arrived.sky
-    sun_there, field_there = present(arrived.sun) & (sky.lit > SEEN), present(arrived.field)
+    out = acted_on(computer)
+    sun_there = present(arrived.sun) & (sky.lit > SEEN) & ~out.sun_out
+    field_there = present(arrived.field) & ~out.field_out
     sun = (known(arrived.sun, zeros()) - quat_to_body(q, sky.sun)) / params.std_sun
     field = (known(arrived.field, zeros()) - quat_to_body(q, sky.field)) / params.std_field
-    check_now = jnp.where(sun_there, sun @ sun, 0) + jnp.where(field_there, field @ field, 0)
-    one = jnp.minimum(met.nis, limits.gate), check_now, jnp.where(sun_there, 3.0, 0) + jnp.where(field_there, 3.0, 0)
-    lines = computer.nis, computer.cross, computer.dof
-    nis, crosses, dof = (jnp.where(came, pushed(line, new), line) for line, new in zip(lines, one))
-    threes = jnp.clip(jnp.sum(dof, axis=0) / 3 - 1, 0, len(CROSS) - 1)
-    threshold = jnp.asarray(limits.cross)[threes.astype(int)]
-    computer = computer._replace(belief=belief, rejected=rejected, nis=nis, cross=crosses, dof=dof)
-    return computer, Sample(came, jnp.where(came, met.nis, 0), jnp.sum(crosses, axis=0) / threshold)
+    there = jnp.stack([sun_there, field_there])
+    now = jnp.where(sun_there, sun @ sun, 0), jnp.where(field_there, field @ field, 0)
+    one = jnp.minimum(met.nis, limits.gate), *now, jnp.where(there, 3.0, 0)
+    lines = computer.nis, computer.sun, computer.field, computer.dof
+    nis, suns, fields, dof = (jnp.where(came, pushed(line, new), line) for line, new in zip(lines, one))
+    slid = [
+        where(came & use, mean + SHARE * (a - mean), mean) for mean, a, use in zip(computer.lean, (sun, field), there)
+    ]
+    silent = jnp.where(arrived.star.valid, 0.0, computer.silent + 1)
+    computer = computer._replace(belief=belief, rejected=rejected, nis=nis, sun=suns, field=fields, dof=dof)
+    computer = computer._replace(lean=tuple(slid), silent=silent)
+    threes, parts = jnp.sum(dof, axis=0) / 3, (jnp.sum(suns, axis=0), jnp.sum(fields, axis=0))
+    index = lambda table, count: jnp.asarray(table)[jnp.clip(count - 1, 0, len(CROSS) - 1).astype(int)]
+    cross = (parts[0] + parts[1]) / index(limits.cross, threes[0] + threes[1])
+    over = [
+        jnp.where(count > 0, jnp.maximum(part / index(CLEAN, count), (mean @ mean) / LEAN), jnp.inf)
+        for part, count, mean in zip(parts, threes, slid)
+    ]  # of the last second, and of the last half minute, which sees a slow drift
+    return computer, Sample(came, jnp.where(came, met.nis, 0), cross, *over)
 
 
 def judge(params: Params, now, computer: Computer, star: Sample) -> Computer:
@@ -496,7 +532,17 @@ def judge(params: Params, now, computer: Computer, star: Sample) -> Computer:
     strange = (computer.rejected >= limits.persistent) | many
     guilty = computer.guilty * now.dt <= limits.memory
     alone = (computer.rejected >= limits.elimination) | (many & (computer.rejected < limits.persistent))
-    blame_star = awake & ~out.star_out & (disagree | (asked & ~guilty & alone))
+    # one of Sun and field that disagrees alone, while nothing is strange, is odd itself (choice 10); a gyro that departs
+    # from the momentum has a bias that followed the star tracker, or torquers that a wrong field drives
+    both = both_seen(star)
+    sun_alone, field_alone = both & (star.field <= 1), both & (star.sun <= 1)
+    sure = (limits.arbiter <= 0) | strange | out.gyro_out | (both & ~sun_alone & ~field_alone)
+    accused = disagree & (sure | (sun_alone & guilty))
+    odd = disagree & ~sure & jnp.stack([sun_alone & ~guilty, field_alone])
+    count = jnp.where(star.arrived, jnp.where(odd, computer.odd + 1, 0), computer.odd)
+    left = awake & ~out.star_out & (count >= limits.odd)
+
+    blame_star = awake & ~out.star_out & (accused | (asked & ~guilty & alone))
     blame_gyro = awake & ~out.star_out & ~out.gyro_out & ~disagree & strange & (guilty | ~asked)
 
     followed = computer.rejected <= 0  # the filter has taken false samples
@@ -506,16 +552,24 @@ def judge(params: Params, now, computer: Computer, star: Sample) -> Computer:
     b = where(blame_gyro, zeros(), where(out.gyro_out, computer.bias, belief.b))
     belief = restarted(belief, anew & computer.act, b, turn * DEG, bias * DEG)
     bias = where(blame_gyro, computer.belief.b, computer.bias)
-    verdict = out._replace(star_out=out.star_out | blame_star, gyro_out=(out.gyro_out | blame_gyro) & ~blame_star)
-    return computer._replace(belief=belief, bias=bias, verdict=verdict)
+    verdict = out._replace(
+        star_out=out.star_out | blame_star, gyro_out=(out.gyro_out | blame_gyro) & ~blame_star,
+        sun_out=out.sun_out | left[0], field_out=out.field_out | left[1],
+    )  # fmt: skip
+    return computer._replace(belief=belief, bias=bias, odd=count, verdict=verdict)
+
+
+def both_seen(star: Sample):
+    """Whether both Sun and field were compared with the star sample."""
+    return (star.sun < jnp.inf) & (star.field < jnp.inf)
 
 
 def backup(params: Params, now, computer: Computer, y: Readings) -> Mekf:
-    """The filter updated by Sun and magnetic field, once a second, where the star tracker is out."""
-    out, lit = acted_on(computer).star_out, y.orbit.lit > SEEN
-
-    due_now = out & (now.k % SECOND == 0)
-    sun, field = (a._replace(valid=a.valid & due_now & good) for a, good in ((y.sun, lit), (y.field, True)))
+    """The filter updated by Sun and magnetic field, once a second, where the star tracker is out or silent."""
+    out = acted_on(computer)
+    due_now = (out.star_out | (computer.silent * now.dt > params.limits.patience)) & (now.k % SECOND == 0)
+    good = (y.orbit.lit > SEEN) & ~out.sun_out, ~out.field_out
+    sun, field = (a._replace(valid=a.valid & due_now & use) for a, use in zip((y.sun, y.field), good))
     belief = update_vector(computer.belief, sun, y.orbit.sun, params.std_sun)[0]
     return update_vector(belief, field, y.orbit.field, params.std_field)[0]
 
@@ -577,7 +631,7 @@ def command(params: Params, now, computer: Computer, y: Readings):
     gains = params.k_wheel, params.windup
     reference, torque = wheel_drive(computer.reference - coasted, demand, tacho, now.dt, *gains)
     torque = out.in_use * jnp.clip(torque, -params.wheel.torque_max, params.wheel.torque_max)
-    return reference, torque, unloading(momentum, computer.field, params.k_unload, params.moment_max)
+    return reference, torque, unloading(momentum, computer.magnetic, params.k_unload, params.moment_max)
 
 
 def earth_pointing(orbit: Surroundings) -> Target:
@@ -598,12 +652,12 @@ def tick(params: Params, scenario: Scenario, now, x: X, z: Z, noise):
     outer = outer_torque(scenario, x, orbit, computer.moment)
 
     belief, out = computer.belief, computer.verdict
-    fault = out.star_out & (out.gyro_out | (orbit.lit < SEEN))
+    fault = out.star_out & (out.gyro_out | out.sun_out | out.field_out | (orbit.lit < SEEN))
     off, e_w, _ = tracking_error(x.q, x.w, earth_pointing(orbit))
     log = Log(
         now.t, x.q, x.w, x.h, quat_angle(off), belief.q, belief.b, quat_angle(quat_conjugate(belief.q) * x.q),
         norm(e_w), mekf_nees(belief, x.q, sensors.gyro.bias), told, out.suspect, out.in_use,
-        out.star_out, out.gyro_out, fault, computer.torque, computer.moment, orbit.lit,
+        out.star_out, out.gyro_out, out.sun_out, out.field_out, fault, computer.torque, computer.moment, orbit.lit,
     )  # fmt: skip
     computer = computer._replace(verdict=out._replace(fault=fault))
     return x, Z(sensors, computer, torque, outer), log
@@ -634,6 +688,8 @@ class Scores(NamedTuple):
     wheel_out: Annotated[Any, "s"]  # (4,) when the wheel was left out
     star_alarm: Annotated[Any, "s"]
     gyro_alarm: Annotated[Any, "s"]
+    sun_alarm: Annotated[Any, "s"]
+    field_alarm: Annotated[Any, "s"]
     fault: Annotated[Any, "s"]  # first time that no attitude was left to trust
     peak: Annotated[Any, "rad"]  # largest angle to nadir from the first onset, or from `SETTLED`
     last: Annotated[Any, "rad"]  # rms angle to nadir from `params.judged` on
@@ -657,6 +713,8 @@ def score(params: Params, scenario: Scenario, now, log: Log) -> Scores:
         wheel_out=scores.first(now, log.in_use == 0),
         star_alarm=scores.first(now, log.star_out),
         gyro_alarm=scores.first(now, log.gyro_out),
+        sun_alarm=scores.first(now, log.sun_out),
+        field_alarm=scores.first(now, log.field_out),
         fault=scores.first(now, log.fault),
         peak=scores.peak(log.pointing, late),
         last=scores.rms(square, now.t >= params.judged),
