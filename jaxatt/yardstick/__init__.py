@@ -1,5 +1,7 @@
 """The yardstick: one fault catalogue, one rate of false alarms, every detector of attitude faults ranked.
 
+`BASELINES` holds the baselines by name, fitted to the public key when it is first asked for.
+
     board = rank([BASELINES["chi2_10"], BASELINES["glr"], mine])
     print(board.table())
 
@@ -23,7 +25,6 @@ from jaxatt.yardstick.telemetry import Detector, Residuals, Verdict, residuals_i
 from jaxatt.yardstick.worlds import CATALOGUE, WORLDS, World
 
 __all__ = [
-    "BASELINES",
     "CATALOGUE",
     "NAMES",
     "WORLDS",

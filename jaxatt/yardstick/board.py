@@ -84,7 +84,7 @@ class Board(NamedTuple):
         left.invert_yaxis()
         left.set_xlim(0, 62)
         left.set_xlabel("restricted mean delay, RMD60 [s]")
-        left.legend(loc="lower right", fontsize=8)
+        left.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=4, frameon=False, fontsize=8)
         names = [row["name"] for row in ranked]
         values = np.array([[cell[name][0] if name in cell else np.nan for name in names] for cell in self.cells.values()], float)  # fmt: skip
         factors = np.geomspace(1, 60, 200)

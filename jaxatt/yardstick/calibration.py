@@ -26,7 +26,7 @@ DISTINCT = 1000  # run maxima below which a rate is an interval
 
 
 class Calibration(NamedTuple):
-    """Thresholds of detectors in each mode, (detectors, modes) all."""
+    """Thresholds of detectors in each mode: arrays of shape (detectors, modes) but for two."""
 
     threshold: Any
     low: Any  # 95 % interval of the threshold, by order statistics

@@ -32,7 +32,8 @@ class Healthy(NamedTuple):
     """Fault-free telemetry: packets of the window, n days in front."""
 
     residuals: Any  # (n, 1200, 7)
-    means: Any  # (n, 1200, 13) ten packets' means of the features
+    features: Any  # (n, 1200, 13)
+    means: Any  # (n, 1200, 13) those of ten packets
 
 
 def _init(params, scenario):
@@ -44,7 +45,7 @@ def _tick(params, scenario, now, x, z, noise):
     x, world, log = leo4.system.tick(params, scenario, now, x, z[0], noise)
     state, r = residuals_step(z[1], log.telemetry)
     recent = jnp.concatenate([z[2][1:], baselines.features(r, log.telemetry)[None]])
-    return x, (world, state, recent), (r, sum(recent[i] for i in range(10)) / 10)
+    return x, (world, state, recent), (r, recent[9], sum(recent[i] for i in range(10)) / 10)
 
 
 def _unchecked(params, scenario):
@@ -67,9 +68,9 @@ def healthy(key=None, windows: int = WINDOWS) -> Healthy:
     call, found = compiled(block_records, 4), []
     for block in range(-(-windows // BLOCK)):
         here = block_of(days, block)
-        r, means = call(_SYSTEM, _both, worlds.PACKETS, 1, params, here, key, np.int32(block))
+        records = call(_SYSTEM, _both, worlds.PACKETS, 1, params, here, key, np.int32(block))
         skipped = round(worlds.WARMUP / leo4.PACKET)
-        found.append([np.moveaxis(np.asarray(a[skipped:], np.float32), -1, 0) for a in (r, means)])
+        found.append([np.moveaxis(np.asarray(a[skipped:], np.float32), -1, 0) for a in records])
     return Healthy(*(np.concatenate(parts)[:windows] for parts in zip(*found)))
 
 
@@ -78,10 +79,10 @@ def _public() -> Healthy:
     return healthy()
 
 
-def pca_params(means) -> baselines.PcaParams:
-    """Plane and limits of the features' means (n, packets, 13)."""
-    flat = np.asarray(means, float).reshape(-1, means.shape[-1])
-    mean, std = flat.mean(0), flat.std(0)
+def pca_params(features, means) -> baselines.PcaParams:
+    """Plane and limits of the ten packets' means, standardised by the features of a packet; (n, packets, 13) both."""
+    single, flat = (np.asarray(a, float).reshape(-1, a.shape[-1]) for a in (features, means))
+    mean, std = single.mean(0), single.std(0)
     z = (flat - mean) / std
     values, vectors = np.linalg.eigh(z.T @ z / len(z))
     values, vectors = values[::-1], vectors[:, ::-1]
@@ -124,4 +125,4 @@ def tune(name: str, key=None) -> Detector:
         return Detector("glr", baselines.glr_init, baselines.glr_step, params, 8)
     if name == "mmae":
         return bank.mmae(covariance)
-    return Detector("pca", baselines.pca_init, baselines.pca_step, pca_params(found.means), 3)
+    return Detector("pca", baselines.pca_init, baselines.pca_step, pca_params(found.features, found.means), 3)

@@ -33,7 +33,7 @@ class Detector(NamedTuple):
     name: str
     init: Callable[[Any], Any]
     step: Callable[[Any, Any, Telemetry], tuple[Any, Verdict]]
-    params: Any = ()
+    params: Any = ()  # `init` and `step` get it first; any tree of arrays
     tuned: int = 0  # how many numbers were fitted
 
 

@@ -9,7 +9,7 @@ May import: leo4, check, vec, contract, faults.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 from zlib import crc32
 
@@ -138,15 +138,19 @@ class World(NamedTuple):
     name: str
     version: str
     system: System  # a tick is one packet
-    params: Any
+    params: Any  # `leo4.Params`
     sample: Callable  # (key, index, cell) -> Scenario; cell None: without a fault
     modes: tuple[str, ...]  # known on board
     units: dict[str, int]  # channels of each unit, in the order of the blame
 
 
-def _drawn(name: str, spread: Spread, key, index, both: tuple[Effect, Effect]) -> leo4.Scenario:
-    """The scenario of one day."""
-    key = jax.random.fold_in(jax.random.fold_in(key, crc32(name.encode())), index)
+def draw(name, spread: Spread, key, index, cell=None) -> leo4.Scenario:
+    """The scenario of one day of a world.
+
+    name: crc32 of the world's name; cell: (kind, size), its `effects`, or None without a fault.
+    """
+    both = effects(cell)
+    key = jax.random.fold_in(jax.random.fold_in(key, name), index)
     gauss, even = jax.random.split(key)  # in float32 whatever the precision of the process
     normal = jnp.split(jax.random.normal(gauss, (26,), jnp.float32), np.cumsum([3, 4, 4, 3, 3, 3]))
     uniform = jax.random.uniform(even, (9,), jnp.float32)
@@ -204,10 +208,7 @@ def _faults(both: tuple[Effect, Effect], onset, where, sign) -> dict:
 
 
 def _world(name: str, spread: Spread, version: str = "1") -> World:
-    def sample(key, index, cell=None):
-        """The scenario of day ``index``: leaves of one scenario; cell: (kind, size), or None without a fault."""
-        return _drawn(name, spread, key, index, effects(cell))
-
+    sample = partial(draw, np.uint32(crc32(name.encode())), spread)
     return World(name, version, leo4.system, leo4.params, sample, ("hold", "slew"), UNITS)
 
 
@@ -231,18 +232,29 @@ def days(world: World, key, numbers, cells) -> Any:
     cells: one cell, or `effects` of shape (n,).
     """
     numbers = np.asarray(numbers, np.int32)
-    wide = lambda a: np.broadcast_to(np.asarray(a, np.float32), numbers.shape)
-    both = jax.tree.map(wide, effects(cells))
-    return jax.tree.map(np.asarray, _many(world.sample)(key, numbers, both))
+    wide = lambda a: np.resize(np.broadcast_to(np.asarray(a, np.float32), numbers.shape), full)
+    full = -(-len(numbers) // DRAWN) * DRAWN
+    both, places = jax.tree.map(wide, effects(cells)), np.resize(numbers, full)
+    sample, of_world = (
+        (world.sample.func, world.sample.args) if isinstance(world.sample, partial) else (world.sample, ())
+    )
+    parts = [
+        _many(sample)(of_world, key, places[i : i + DRAWN], jax.tree.map(lambda a, i=i: a[i : i + DRAWN], both))
+        for i in range(0, full, DRAWN)
+    ]
+    return jax.tree.map(lambda *a: np.concatenate(a)[: len(numbers)], *parts)
+
+
+DRAWN = 256  # days that are drawn at once: one program for all worlds, cells and numbers of days
 
 
 @lru_cache
 def _many(sample: Callable):
-    """Many days of a world, compiled once for all cells."""
+    """Days of a world, whose numbers are operands, compiled once."""
 
-    def run(key, numbers, both):
-        drawn = jax.vmap(sample, in_axes=(None, 0, 0))(key, numbers, both)
-        return jax.tree.map(lambda a: jnp.broadcast_to(a, (len(numbers), *a.shape[1:])).astype(jnp.float32), drawn)
+    def run(of_world, key, numbers, both):
+        drawn = jax.vmap(partial(sample, *of_world), in_axes=(None, 0, 0))(key, numbers, both)
+        return jax.tree.map(lambda a: jnp.broadcast_to(a, (DRAWN, *a.shape[1:])).astype(jnp.float32), drawn)
 
     return jax.jit(run)
 
