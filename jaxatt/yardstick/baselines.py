@@ -206,9 +206,9 @@ def glr_params(covariance, laws, lags: tuple = LAGS) -> GlrParams:
         star.append(1 / np.sqrt(square[1]))
         wheel.append(push / np.sqrt(np.sum(push**2, axis=1, keepdims=True) * square[2]))
     whiten = [inverse_root[0, 0], inverse_root[1, 0], inverse_root[1, 1], 1 / np.sqrt(covariance[3, 3])]
-    made = whiten, tuple(white[:k] for k in lags), tuple(parity[:k, None, None] for k in lags), gyro, star, wheel
     short = lambda a: np.asarray(a, np.float32)
-    return GlrParams(*(tuple(map(short, a)) if isinstance(a, tuple) else short(a) for a in made))
+    axis, across = (tuple(short(a[:k]) for k in lags) for a in (white, parity[:, None, None]))
+    return GlrParams(short(whiten), axis, across, short(gyro), short(star), short(wheel))
 
 
 def glr_init(params: GlrParams) -> GlrState:

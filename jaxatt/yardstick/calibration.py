@@ -124,4 +124,5 @@ def calibration(modes: int, healthy: Found, fresh, rate: float) -> Calibration:
     arrays = {name: np.array(values, float) for name, values in rows.items()}
     pointing = np.asarray(healthy.pointing)
     arrays["excess"] = np.array([np.quantile(pointing[m::modes], 0.99) for m in range(modes)])
-    return Calibration(**(arrays | {"windows": len(peak) // modes}))
+    given: dict[str, Any] = arrays | {"windows": len(peak) // modes}
+    return Calibration(**given)

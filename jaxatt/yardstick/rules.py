@@ -176,7 +176,7 @@ def seed_of(world: worlds.World, detectors: Sequence[Detector], board: str) -> i
 
 def key_of(seed: int):
     """The key of 64 bits."""
-    return jax.random.wrap_key_data(np.array([seed >> 32, seed & 0xFFFFFFFF], np.uint32))
+    return jax.random.wrap_key_data(jnp.array([seed >> 32, seed & 0xFFFFFFFF], jnp.uint32))
 
 
 def validated(detectors: Sequence[Detector]) -> tuple[Detector, ...]:
