@@ -37,6 +37,7 @@ EXPERIMENTS = {
     "wheel_mrac": Experiment(30, 77, "loss_of_effectiveness"),
     "microsat": Experiment(90, 50, "reconfiguration"),
     "rare_events": Experiment(60, 18, "curves"),
+    "yardstick": Experiment(110, 38, "board"),
 }
 NAMES = tuple(EXPERIMENTS)
 STUDIES = {"tune": "experiments.tuning"}  # words that may follow the names, and where the studies lie

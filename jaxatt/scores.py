@@ -336,6 +336,29 @@ def alarm_time(now, value, threshold, since: Any = 0.0) -> Crossing:
     return Crossing(jnp.where(excess > 0, t, jnp.inf), excess, t, excess, t)
 
 
+# the value at an event
+
+
+class Held(NamedTuple):
+    """Value at the first tick at which something held; NaN if it never did."""
+
+    seen: Any = False  # bool
+    kept: Any = jnp.nan  # [unit of the value]
+
+    def __add__(self, later):
+        return Held(self.seen | later.seen, jnp.where(self.seen, self.kept, later.kept))
+
+    def value(self):
+        return jnp.where(self.seen, self.kept, jnp.nan)
+
+
+def held(value, condition) -> Held:
+    """Tally the value at the first tick at which the condition holds."""
+    value = real(value)
+    seen = jnp.broadcast_to(truth(condition), value.shape)
+    return Held(seen, jnp.where(seen, value, jnp.nan))
+
+
 # what a cost that is not finite is made of
 
 listening: ContextVar[bool] = ContextVar("whether somebody asks what a cost is made of", default=False)

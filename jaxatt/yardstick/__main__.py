@@ -1,0 +1,44 @@
+"""Rebuild a board from its file and compare: ``python -m jaxatt.yardstick board.json``.
+
+The rows must be baselines. Says where the new board differs, and returns 1 if it does.
+
+May import: board, fitting, ranking, worlds, compiling.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from jaxatt.compiling import configure
+from jaxatt.yardstick.board import Board, differences
+from jaxatt.yardstick.fitting import NAMES, tune
+from jaxatt.yardstick.ranking import rank
+from jaxatt.yardstick.worlds import WORLDS
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The command."""
+    parser = argparse.ArgumentParser(prog="python -m jaxatt.yardstick", description=__doc__)
+    parser.add_argument("board", type=Path, help="JSON of a board, as `Board.to_json` writes it")
+    args = parser.parse_args(arguments)
+    configure()
+    before = Board.from_json(args.board)
+    h = before.header
+    unknown = [name for name in h["detectors"] if name not in NAMES]
+    if unknown or h["seed"] is None:
+        parser.error(
+            f"`board` must hold baselines ranked by their hash, but it is of {', '.join(unknown) or 'a key of its own'}."
+        )
+    cells = None if h["cells"] is None else [(k, tuple(s) if isinstance(s, list) else s) for k, s in h["cells"]]
+    how = {"ruleset": h["ruleset"], "days": h["days"], "hours": h["hours"], "cells": cells}
+    now = rank([tune(name) for name in h["detectors"]], WORLDS[h["world"]], **how, progress=True)
+    print(now.table())
+    apart = differences(before, now)
+    print("\n".join(apart[:20]) or "the same to the bit")
+    return 1 if apart else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,364 @@
+"""The classical baselines and the reference rows, each a `Detector`; the bank of filters is in `bank`.
+
+z = L^-1 r of the residuals r (`telemetry.residuals_step`), L L' = Sigma, their covariance in healthy runs.
+
+May import: leo4, telemetry, products, vec, batching, detection.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxatt.batching import in_lanes
+from jaxatt.detection import Cusum, cusum, window_sum
+from jaxatt.vec import Quat, Vec3, cross, norm
+from jaxatt.yardstick import leo4
+from jaxatt.yardstick.leo4 import Telemetry
+from jaxatt.yardstick.products import correlations, product, pushed
+from jaxatt.yardstick.telemetry import (
+    Detector,
+    Residuals,
+    Verdict,
+    blame,
+    residuals_init,
+    residuals_step,
+)
+
+LAGS = (1, 2, 4, 8, 16, 32, 64, 128)  # [packets] of the GLR
+ALL = np.ones(11)
+
+
+def everyone(like):
+    """The blame of a detector that cannot tell."""
+    return jnp.ones(11, like.dtype)
+
+
+# the published observer
+
+
+class Observer(NamedTuple):
+    """State of the MRP observer."""
+
+    q: Vec3  # MRP
+    w: Vec3  # [rad/s]
+    seen: Any  # [packets]
+
+
+class ObserverParams(NamedTuple):
+    """Gains of the observer, and where its blame turns from gyros to the star tracker."""
+
+    alpha: Any = 1.1  # [1/s]
+    beta: Any = 15.0  # [N m s]
+    ratio: Any = 0.832  # [s] of the residuals of attitude and rate
+
+
+def mrp_init(params: ObserverParams) -> Observer:
+    """Before the first packet, from which it takes the MEKF's estimate."""
+    zero = jnp.zeros(())
+    three = Vec3(zero, zero, zero)
+    return Observer(three, three, zero)
+
+
+def _rate_map(q: Vec3, w: Vec3, sign: int = 1) -> Vec3:
+    """G(q) w, or with sign -1 its transpose, of MRP."""
+    return ((1 - q @ q) * w + (2 * sign) * cross(q, w) + (2 * (q @ w)) * q) / 4
+
+
+def _mrp(p: Quat) -> Vec3:
+    return jnp.where(p.w < 0, -1, 1) / (1 + jnp.abs(p.w)) * p.v
+
+
+def mrp_step(params: ObserverParams, z: Observer, telemetry: Telemetry) -> tuple[Observer, Verdict]:
+    """Yun & Kang (2020), eq. (7), by Euler's rule at 10 Hz with the star sample held; the largest |xi| of five ticks."""
+    first = z.seen == 0
+    begun = _mrp(Quat.of(telemetry.attitude)), leo4.rate_of(telemetry.gyro[0]) - Vec3.of(telemetry.bias)
+    q, w = (Vec3(*(jnp.where(first, a, b) for a, b in zip(new, old))) for new, old in zip(begun, z[:2]))
+    measured = _mrp(Quat.of(telemetry.star))
+    x_q = measured - q
+    worst, ratio = 0.0 * z.seen, 0.0 * z.seen
+    for i in range(leo4.TICKS):
+        y = leo4.rate_of(telemetry.gyro[i])
+        x_w, at = y - w, measured if i == 0 else q
+        size = jnp.sqrt(x_q @ x_q + x_w @ x_w)
+        ratio = jnp.where(size > worst, norm(x_q) / norm(x_w), ratio)
+        worst = jnp.where(size > worst, size, worst)
+        u = leo4.summed(telemetry.torque[i]) + params.beta * x_w + _rate_map(at, x_q, -1)
+        q_next = q + leo4.DT * _rate_map(at, w)
+        if i == 0:
+            q_next = q_next + (params.alpha * leo4.PACKET) * x_q
+        q, w = q_next, w + leo4.DT * (leo4.INVERSE @ (u - cross(w, leo4.INERTIA @ y)))
+    star = jnp.where(ratio > params.ratio, 1.0, 0.0).astype(worst.dtype)
+    return Observer(q, w, z.seen + 1), Verdict(worst, blame(gyro=1 - star, star=star))
+
+
+# chi-square of the MEKF's innovation
+
+
+def summed(line, new):
+    """The window (N, ...) of the latest with one more, and its sum: `detection.window_sum` with a batch left where it is."""
+    return in_lanes(window_sum, line, new)
+
+
+def window_init(packets: int, params) -> Any:
+    """A window of so many packets."""
+    return jnp.zeros(packets)
+
+
+def chi2_step(params, z, telemetry: Telemetry):
+    """Sum of nu'nu / S over the window; params: S [rad^2]."""
+    nu = telemetry.innovation
+    z, score = summed(z, jnp.sum(nu * nu) / params)
+    return z, Verdict(score, everyone(score))
+
+
+# residuals
+
+
+class Windowed(NamedTuple):
+    """Residuals and a window of what is made of them."""
+
+    residuals: Residuals
+    recent: Any
+
+
+def parity_init(packets: int, params) -> Windowed:
+    return Windowed(residuals_init(), jnp.zeros(packets))
+
+
+def parity_step(params, z: Windowed, telemetry: Telemetry):
+    """|sum of the parity over the window| / (sd sqrt N); params: sd [rad/s]."""
+    residuals, r = residuals_step(z.residuals, telemetry)
+    recent, total = summed(z.recent, r[3])
+    score = jnp.abs(total) / (params * np.sqrt(len(recent)).item())
+    return Windowed(residuals, recent), Verdict(score, blame(gyro=jnp.ones_like(score), star=0.0, wheel=0.0))
+
+
+class Sums(NamedTuple):
+    """Residuals and their two-sided sums."""
+
+    residuals: Residuals
+    sums: Cusum  # (7,)
+
+
+class CusumParams(NamedTuple):
+    """Scale and slack."""
+
+    std: Any  # (7,)
+    slack: Any = 0.25  # [1] half the shift that matters
+
+
+def cusum_init(params: CusumParams) -> Sums:
+    return Sums(residuals_init(), Cusum(jnp.zeros(7), jnp.zeros(7)))
+
+
+def cusum_step(params: CusumParams, z: Sums, telemetry: Telemetry):
+    """Page's sums of the seven standardised residuals; the blame is on the unit of the largest."""
+    residuals, r = residuals_step(z.residuals, telemetry)
+    sums, channels = cusum(z.sums, r / params.std, params.slack)
+    score = jnp.max(channels)
+    parts = [jnp.max(channels[3:4]), jnp.max(channels[:3]), jnp.max(channels[4:])]
+    guilty = [jnp.where(part >= score, 1.0, 0.0).astype(score.dtype) for part in parts]
+    return Sums(residuals, sums), Verdict(score, blame(*guilty))
+
+
+class GlrParams(NamedTuple):
+    """What the GLR is fitted to. The geometry is isotropic: all axes answer alike, by three laws of time."""
+
+    whiten: Any  # (4,) of an axis: z = (a nu, b nu + c dyn), and 1 / sd of the parity
+    axis: tuple  # for each lag l (l, 3, 2): steps of gyro, star and wheel as seen by the two z of an axis, oldest first
+    parity: tuple  # (l, 1, 1) a gyro's step as seen by the parity
+    gyro: Any  # (lags, 4, 4) each channel's share of three axes and of the parity, over the length of its filter
+    star: Any  # (lags,)
+    wheel: Any  # (lags, 4, 3)
+
+
+class GlrState(NamedTuple):
+    """Residuals and their whitened past."""
+
+    residuals: Residuals
+    axes: Any  # (128, 2, 3) oldest first
+    parity: Any  # (128, 1, 1)
+
+
+def glr_params(covariance, laws, lags: tuple = LAGS) -> GlrParams:
+    """Filters of unit steps of the eleven channels.
+
+    covariance: (7, 7) of the residuals; laws: responses in time to a unit step, `bank.laws`.
+    """
+    of_axis, of_parity = laws
+    nu, dyn = np.diag(covariance)[:3].mean(), np.diag(covariance)[4:].mean()
+    both = np.mean([covariance[i, 4 + i] for i in range(3)])
+    inverse_root = np.linalg.inv(np.linalg.cholesky([[nu, both], [both, dyn]]))
+    parity = of_parity / np.sqrt(covariance[3, 3])
+    white = of_axis @ inverse_root.T  # (packets, 3, 2)
+    mean, push = 0.75 * np.array(leo4.AXES).T, -np.linalg.solve(np.array(leo4.INERTIA), np.array(leo4.AXES)).T
+    gyro, star, wheel = [], [], []
+    for lag in lags:
+        square, across = np.sum(white[:lag] ** 2, axis=(0, 2)), np.sum(parity[:lag] ** 2)
+        shares = np.hstack([mean, np.array(leo4.PARITY)[:, None]])
+        length = np.sqrt(np.sum(mean**2, axis=1) * square[0] + np.array(leo4.PARITY) ** 2 * across)
+        gyro.append(shares / length[:, None])
+        star.append(1 / np.sqrt(square[1]))
+        wheel.append(push / np.sqrt(np.sum(push**2, axis=1, keepdims=True) * square[2]))
+    whiten = [inverse_root[0, 0], inverse_root[1, 0], inverse_root[1, 1], 1 / np.sqrt(covariance[3, 3])]
+    short = lambda a: np.asarray(a, np.float32)
+    axis, across = (tuple(short(a[:k]) for k in lags) for a in (white, parity[:, None, None]))
+    return GlrParams(short(whiten), axis, across, short(gyro), short(star), short(wheel))
+
+
+def glr_init(params: GlrParams) -> GlrState:
+    longest = max(map(len, params.axis))
+    return GlrState(residuals_init(), jnp.zeros((longest, 2, 3)), jnp.zeros((longest, 1, 1)))
+
+
+def glr_step(params: GlrParams, z: GlrState, telemetry: Telemetry):
+    """max over channels h and lags l of |f_hl . z| / |f_hl| over the last l packets; blame: softmax of its square / 2."""
+    residuals, r = residuals_step(z.residuals, telemetry)
+    a, b, c, d = params.whiten
+    axes = pushed(z.axes, jnp.stack([a * r[:3], b * r[:3] + c * r[4:]]))
+    parity = pushed(z.parity, d * r[3:4, None])
+    best = jnp.zeros(11, r.dtype)
+    seen = zip(correlations(params.axis, axes), correlations(params.parity, parity))
+    for (of_axes, of_parity), gyro, star, wheel in zip(seen, params.gyro, params.star, params.wheel):
+        gyros = product(gyro, jnp.concatenate([of_axes[0], of_parity[0]]))
+        found = jnp.concatenate([gyros, star * of_axes[1], product(wheel, of_axes[2])])
+        best = jnp.maximum(best, jnp.abs(found))
+    score = jnp.max(best)
+    return GlrState(residuals, axes, parity), Verdict(score, jax.nn.softmax(0.5 * best * best))
+
+
+# ten packets' means, without dynamics
+
+
+class PcaParams(NamedTuple):
+    """A plane of healthy features, and the limits in it and off it."""
+
+    mean: Any  # (13,)
+    std: Any  # (13,)
+    main: Any  # (k, 13) components with their scores of unit variance
+    rest: Any  # (13, 13) projection off the plane
+    limits: Any  # (2,) of T2 and Q
+
+
+def features(residual, telemetry: Telemetry):
+    """Features (13,) of a packet: innovation, mean readings of the gyros, dynamics, mean torque on the body."""
+    gyro = sum(telemetry.gyro[i] for i in range(leo4.TICKS)) / leo4.TICKS
+    torque = sum(telemetry.torque[i] for i in range(leo4.TICKS)) / leo4.TICKS
+    return jnp.concatenate([residual[:3], gyro, residual[4:], jnp.stack(leo4.summed(torque))])
+
+
+def pca_init(params) -> Windowed:
+    return Windowed(residuals_init(), jnp.zeros((10, 13)))
+
+
+def pca_step(params: PcaParams, z: Windowed, telemetry: Telemetry):
+    """max(T2 / T2lim, Q / Qlim) of the ten packets' mean; blame: each unit's share of the squared residual."""
+    residuals, r = residuals_step(z.residuals, telemetry)
+    recent, total = summed(z.recent, features(r, telemetry))
+    standard = (total / 10 - params.mean) / params.std
+    main, rest = product(params.main, standard), product(params.rest, standard)
+    share = rest * rest
+    score = jnp.maximum(jnp.sum(main * main) / params.limits[0], jnp.sum(share) / params.limits[1])
+    parts = [jnp.sum(share[3:7]), jnp.sum(share[:3]), jnp.sum(share[7:])]
+    return Windowed(residuals, recent), Verdict(score, blame(*parts))
+
+
+# reference rows
+
+
+def null_step(params, z, telemetry: Telemetry):
+    """Never alarms."""
+    score = 0 * telemetry.innovation[0]
+    return z, Verdict(score, everyone(score))
+
+
+def random_step(params, z, telemetry: Telemetry):
+    """A hash of the packet's bits, uniform in [0, 1)."""
+    words = jax.lax.bitcast_convert_type(telemetry.gyro.astype(jnp.float32).reshape(-1), jnp.uint32)
+    h = jnp.uint32(2166136261)
+    for i in range(leo4.TICKS * 4):
+        h = (h ^ words[i]) * jnp.uint32(16777619)
+        h = h ^ (h >> 15)
+    h = (h ^ (h >> 13)) * jnp.uint32(0xC2B2AE35)
+    score = ((h ^ (h >> 16)) >> 8).astype(telemetry.gyro.dtype) * 2.0**-24
+    return z, Verdict(score, everyone(score))
+
+
+class Clock(NamedTuple):
+    """The window of chi2_10 and how many packets have come."""
+
+    recent: Any
+    seen: Any
+
+
+def clock_init(params) -> Clock:
+    return Clock(jnp.zeros(10), jnp.zeros(()))
+
+
+def clock_step(params, z: Clock, telemetry: Telemetry):
+    """chi2_10 that counts packets and alarms in the first third of the window alone: what the onset law must not reward."""
+    recent, verdict = chi2_step(params, z.recent, telemetry)
+    first = (z.seen >= 600) & (z.seen < 1000)
+    return Clock(recent, z.seen + 1), Verdict(jnp.where(first, verdict.score, 0), verdict.blame)
+
+
+class Flat(NamedTuple):
+    """Last readings and for how long each has been the same."""
+
+    gyro: Any  # (4,)
+    star: Any  # (4,)
+    gyro_same: Any  # (4,)
+    star_same: Any
+
+
+def flat_init(params) -> Flat:
+    return Flat(jnp.zeros(4), jnp.zeros(4), jnp.zeros(4), jnp.zeros(()))
+
+
+def flat_step(params, z: Flat, telemetry: Telemetry):
+    """For how many readings in a row a gyro or the star tracker has repeated itself exactly."""
+    last, same = z.gyro, z.gyro_same
+    for i in range(leo4.TICKS):
+        same = jnp.where(telemetry.gyro[i] == last, same + 1, 0)
+        last = telemetry.gyro[i]
+    star = jnp.where(jnp.all(telemetry.star == z.star), z.star_same + 1, 0)
+    score = jnp.maximum(jnp.max(same), star)
+    none = 0 * score
+    guilty = blame(none, jnp.where(star > 0, 1.0, 0.0).astype(score.dtype), none).at[:4].set(same)
+    return Flat(last, telemetry.star, same, star), Verdict(score, guilty + 1e-6)
+
+
+# rows
+
+
+S = leo4.STD_INNOVATION**2
+
+
+def chi2(packets: int) -> Detector:
+    """The chi-square row of so many packets."""
+    return Detector(f"chi2_{packets}", partial(window_init, packets), chi2_step, np.float32(S), 1)
+
+
+def parity(packets: int, std) -> Detector:
+    """The parity row of so many packets; std: of the parity residual [rad/s]."""
+    name = "parity" if packets == 10 else f"parity {packets // 2} s"
+    return Detector(name, partial(parity_init, packets), parity_step, np.float32(std), 1)
+
+
+def nothing(params):
+    """No state."""
+    return ()
+
+
+MRP = Detector("mrp", mrp_init, mrp_step, ObserverParams(*map(np.float32, ObserverParams())), 3)
+REFERENCE = (
+    Detector("null", nothing, null_step),
+    Detector("random", nothing, random_step),
+    Detector("clock", clock_init, clock_step, np.float32(S), 1),
+    Detector("flatline", flat_init, flat_step),
+)

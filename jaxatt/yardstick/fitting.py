@@ -1,0 +1,128 @@
+"""The baselines fitted to fault-free telemetry of the tuning key, which is public: ``jax.random.key(0)``.
+
+May import: leo4, telemetry, worlds, baselines, bank, check, compiling,
+noise, engine, sweeping.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxatt import check
+from jaxatt.compiling import compiled
+from jaxatt.noise import BLOCK, one_key
+from jaxatt.sweeping import block_of, block_records
+from jaxatt.yardstick import bank, baselines, leo4, worlds
+from jaxatt.yardstick.telemetry import Detector, residuals_init, residuals_step
+
+WINDOWS = 256
+SHARE = 0.95  # of the features' variance that the plane of pca holds
+NAMES = (
+    "mrp", "chi2_1", "chi2_10", "chi2_60", "parity", "parity 30 s", "cusum", "glr", "mmae", "pca",
+    "null", "random", "clock", "flatline",
+)  # fmt: skip
+
+
+class Healthy(NamedTuple):
+    """Fault-free telemetry: packets of the window, n days in front."""
+
+    residuals: Any  # (n, 1200, 7)
+    features: Any  # (n, 1200, 13)
+    means: Any  # (n, 1200, 13) those of ten packets
+
+
+def _init(params, scenario):
+    x, z = leo4.system.init(params, scenario)
+    return x, (z, residuals_init(), jnp.zeros((10, 13)))
+
+
+def _tick(params, scenario, now, x, z, noise):
+    x, world, log = leo4.system.tick(params, scenario, now, x, z[0], noise)
+    state, r = residuals_step(z[1], log.telemetry)
+    recent = jnp.concatenate([z[2][1:], baselines.features(r, log.telemetry)[None]])
+    return x, (world, state, recent), (r, recent[9], sum(recent[i] for i in range(10)) / 10)
+
+
+def _unchecked(params, scenario):
+    """Days are drawn, not typed."""
+
+
+_SYSTEM = leo4.system._replace(init=_init, tick=_tick, check=_unchecked)
+
+
+def _both(log):
+    return log
+
+
+def healthy(key=None, windows: int = WINDOWS) -> Healthy:
+    """Residuals and features of fault-free days of leo4, NumPy; key None for the public one."""
+    key = one_key(jax.random.key(0) if key is None else key)
+    world = worlds.WORLDS["leo4"]
+    days = worlds.days(world, jax.random.wrap_key_data(key), np.arange(windows), None)
+    params = jax.tree.map(lambda a: np.asarray(a, np.float32), world.params)
+    call, found = compiled(block_records, 4), []
+    for block in range(-(-windows // BLOCK)):
+        here = block_of(days, block)
+        records = call(_SYSTEM, _both, worlds.PACKETS, 1, params, here, key, np.int32(block))
+        skipped = round(worlds.WARMUP / leo4.PACKET)
+        found.append([np.moveaxis(np.asarray(a[skipped:], np.float32), -1, 0) for a in records])
+    return Healthy(*(np.concatenate(parts)[:windows] for parts in zip(*found)))
+
+
+@lru_cache
+def _public() -> Healthy:
+    return healthy()
+
+
+def pca_params(features, means) -> baselines.PcaParams:
+    """Plane and limits of the ten packets' means, standardised by the features of a packet; (n, packets, 13) both."""
+    single, flat = (np.asarray(a, float).reshape(-1, a.shape[-1]) for a in (features, means))
+    mean, std = single.mean(0), single.std(0)
+    z = (flat - mean) / std
+    values, vectors = np.linalg.eigh(z.T @ z / len(z))
+    values, vectors = values[::-1], vectors[:, ::-1]
+    k = int(np.searchsorted(np.cumsum(values) / values.sum(), SHARE)) + 1
+    main = vectors[:, :k].T / np.sqrt(values[:k, None])
+    rest = np.eye(len(values)) - vectors[:, :k] @ vectors[:, :k].T
+    limits = [np.quantile(np.sum((z @ m.T) ** 2, axis=1), 0.9999) for m in (main, rest)]
+    return baselines.PcaParams(*(np.asarray(a, np.float32) for a in (mean, std, main, rest, limits)))
+
+
+def tune(name: str, key=None) -> Detector:
+    """A baseline fitted anew.
+
+    Args:
+        name: one of `NAMES`.
+        key: of the fault-free days that it is fitted to; None for the public ones of ``jax.random.key(0)``.
+
+    Raises:
+        ValueError: a name that is none of them.
+
+    Example:
+        >>> glr = tune("glr")
+    """
+    fixed = {d.name: d for d in (baselines.MRP, *map(baselines.chi2, (1, 10, 60)), *baselines.REFERENCE)}
+    if name in fixed:
+        return fixed[name]
+    if name not in NAMES:
+        check.refuse("name", f"be one of {', '.join(NAMES)}", check.short(name))
+    found = _public() if key is None else healthy(key)
+    r = found.residuals.reshape(-1, 7).astype(float)
+    covariance = r.T @ r / len(r)
+    std = np.sqrt(np.diag(covariance))
+    if name.startswith("parity"):
+        return baselines.parity(10 if name == "parity" else 60, std[3])
+    if name == "cusum":
+        params = baselines.CusumParams(std.astype(np.float32), np.float32(0.25))
+        return Detector("cusum", baselines.cusum_init, baselines.cusum_step, params, 1)
+    if name == "glr":
+        params = baselines.glr_params(covariance, bank.laws())
+        return Detector("glr", baselines.glr_init, baselines.glr_step, params, 8)
+    if name == "mmae":
+        return bank.mmae(covariance)
+    return Detector("pca", baselines.pca_init, baselines.pca_step, pca_params(found.features, found.means), 3)

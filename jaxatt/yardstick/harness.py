@@ -1,0 +1,179 @@
+"""Detectors in the loop: several share one simulation, and each day leaves a few numbers.
+
+The tallies of a detector: its largest score in the window, its first alarm after the onset, whether it alarmed before,
+its blame at the alarm and ten seconds later, the pointing error until the alarm, episodes of alarms. Several detectors
+run in one sweep and cost one simulation. The score of a packet counts at its stamp, t = 0 at the window's start.
+
+May import: leo4, telemetry, worlds, contract, scores, sweeping.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxatt import scores
+from jaxatt.contract import System
+from jaxatt.sweeping import sweep
+from jaxatt.yardstick import leo4, worlds
+from jaxatt.yardstick.telemetry import Detector
+from jaxatt.yardstick.worlds import PACKETS, WARMUP, World
+
+LATER = 10.0  # [s] after an alarm at which the blame is read again
+HORIZON = 60.0  # [s] after which a delay counts no further
+QUIET = 60.0  # [s] that end an episode of alarms
+SIXTHS = 6
+
+
+class Params(NamedTuple):
+    """The world's params, each detector's, and what the harness decides."""
+
+    world: Any
+    detectors: tuple
+    threshold: Any  # (detectors, modes)
+    excess: Any  # (modes,) [rad] pointing error above which it counts
+
+
+class Watch(NamedTuple):
+    """State of the harness beside the world's and the detectors'."""
+
+    alarm: Any  # (detectors,) [s] first alarm after the onset; inf before
+    last: Any  # (detectors,) [s] last alarm
+
+
+class Told(NamedTuple):
+    """What a packet told."""
+
+    t: Any  # [s] stamp in the window
+    score: Any  # (detectors,)
+    up: Any  # (detectors,) bool: in the window and not at or below the threshold
+    blame: Any  # (detectors, 11)
+    alarm: Any  # (detectors,) [s] first alarm after the onset until now
+    quiet: Any  # (detectors,) [s] since the last alarm before
+    pointing: Any  # (5,) [rad]
+
+
+class Found(NamedTuple):
+    """What a day leaves; n days in front, then the detectors."""
+
+    peak: Any  # largest score in the window
+    first: Any  # [s] from the onset to the first alarm after it
+    punctual: Any  # bool: no alarm up to the onset
+    at_alarm: Any  # (11,) blame at that alarm; NaN without
+    later: Any  # (11,) ten seconds on
+    excess: Any  # [rad s] pointing error beyond the healthy until the alarm or 60 s
+    episodes: Any  # of alarms in the window
+    last: Any  # score of the last packet
+    sixths: Any  # (6,) packets with an alarm in each sixth of the window
+    unclear: Any  # share of packets whose score is NaN
+    pointing: Any  # [rad] at the end
+
+
+def onset(scenario: leo4.Scenario):
+    """The first onset [s] of a day, from the start of the run; inf without a fault."""
+    here = [jnp.min(fault.onset) for fault in (scenario.gyro, scenario.star, scenario.wheel)]
+    return jnp.minimum(jnp.minimum(here[0], here[1]), jnp.minimum(here[2], scenario.box.onset))
+
+
+@lru_cache
+def watched(system: System, steps: tuple) -> System:
+    """The world's system with detectors in its tick; steps: their (init, step). Equal arguments give the same system."""
+
+    def init(params: Params, scenario):
+        x, z = system.init(params.world, scenario)
+        like = jax.tree.leaves(z)[0]
+        states = tuple(start(p) for (start, _), p in zip(steps, params.detectors))
+        n = len(steps)
+        return x, (z, states, Watch(jnp.full(n, jnp.inf, like.dtype), jnp.full(n, -jnp.inf, like.dtype)))
+
+    def tick(params: Params, scenario, now, x, z, noise):
+        world, states, watch = z
+        x, world, log = system.tick(params.world, scenario, now, x, world, noise)
+        told = [step(p, s, log.telemetry) for (_, step), p, s in zip(steps, params.detectors, states)]
+        score = jnp.stack([verdict.score for _, verdict in told])
+        t = now.t + (leo4.PACKET - WARMUP)
+        limit = jnp.where(log.telemetry.mode > 0, params.threshold[:, 1], params.threshold[:, 0])
+        up = ~(score <= limit) & (t > 0)
+        found = up & jnp.isinf(watch.alarm) & (t > onset(scenario) - WARMUP)
+        alarm = jnp.where(found, t, watch.alarm)
+        out = Told(t, score, up, jnp.stack([v.blame for _, v in told]), alarm, t - watch.last, log.pointing)
+        return x, (world, tuple(s for s, _ in told), Watch(alarm, jnp.where(up, t, watch.last))), out
+
+    def flow(params: Params, scenario, t, x, z):
+        return system.flow(params.world, scenario, t, x, z[0])
+
+    return system._replace(init=init, tick=tick, flow=flow, check=_unchecked)
+
+
+def _unchecked(params, scenario):
+    """Days are drawn, not typed."""
+
+
+def score(params: Params, scenario, now, told: Told) -> Found:
+    """The tallies of one packet."""
+    since = onset(scenario) - WARMUP
+    inside, after = told.t > 0, told.t > since
+    mode = jnp.where(scenario.mode > 0, 1, 0)
+    ticks = told.t - leo4.PACKET + leo4.DT * jnp.arange(leo4.TICKS, dtype=told.t.dtype)
+    counted = (ticks >= since) & (ticks < since + HORIZON)
+    beyond = jnp.where(counted, jnp.maximum(told.pointing - params.excess[mode], 0), 0)
+    excess = leo4.DT * sum(beyond[i] for i in range(leo4.TICKS))
+    sixth = jnp.floor(told.t * (SIXTHS / worlds.WINDOW) - 1e-6)
+    here = (jnp.arange(SIXTHS) == sixth) & inside
+    return Found(
+        peak=scores.peak(told.score, inside),
+        first=scores.first(now, told.up & after, since + (WARMUP - leo4.PACKET)),
+        punctual=scores.always(~(told.up & ~after)),
+        at_alarm=scores.held(told.blame, (told.up & after)[:, None]),
+        later=scores.held(told.blame, (told.t >= told.alarm + LATER)[:, None]),
+        excess=scores.total(excess + 0 * told.score, ~(told.alarm < told.t) & after),
+        episodes=scores.total(1.0 * (told.up & (told.quiet > QUIET)).astype(told.score.dtype)),
+        last=scores.final(told.score),
+        sixths=scores.total((told.up[:, None] & here).astype(told.score.dtype)),
+        unclear=scores.mean(jnp.isnan(told.score).astype(told.score.dtype), inside),
+        pointing=scores.final(told.pointing[-1]),
+    )
+
+
+def run(
+    world: World, detectors: Sequence[Detector], key, days, *, threshold=None, excess=None, progress=False
+) -> Found:
+    """What n days leave of every detector.
+
+    Args:
+        world: of the days.
+        detectors: that watch, side by side.
+        key: of the noise: day i meets ``noise_of(world.system, key, i, PACKETS)``.
+        days: scenarios, leaves with n in front (`worlds.days`).
+        threshold: (detectors, modes); None for no alarms.
+        excess: (modes,) [rad] pointing error that is healthy; None for infinite.
+        progress: show a bar.
+
+    Returns:
+        NumPy arrays, (n, ...).
+
+    Example:
+        >>> found = run(WORLDS["leo4"], [chi2(10)], key, days(WORLDS["leo4"], key, np.arange(128), None))
+    """
+    detectors = tuple(detectors)
+    n, modes = len(detectors), len(world.modes)
+    system = watched(world.system, tuple((d.init, d.step) for d in detectors))
+    wide = lambda a, shape: np.full(shape, np.inf, np.float32) if a is None else np.asarray(a, np.float32)
+    params = Params(
+        world.params, tuple(d.params for d in detectors), wide(threshold, (n, modes)), wide(excess, (modes,))
+    )
+    params = jax.tree.map(_short, params)
+    with np.errstate(all="ignore"):
+        found = sweep(system, params, days, key, ticks=PACKETS, score=score, progress=progress)
+    return found
+
+
+def _short(a):
+    """A number in float32, the type of all runs of the yardstick."""
+    a = np.asarray(a)
+    return a.astype(np.float32) if a.dtype.kind == "f" else a

@@ -1,0 +1,212 @@
+"""What a machine checks before a detector is ranked, and the key of the test days, which the detectors themselves fix.
+
+May import: leo4, telemetry, worlds, check, compiling, noise, sweeping.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import time
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxatt import check
+from jaxatt.compiling import compiled, jitted
+from jaxatt.noise import one_key
+from jaxatt.sweeping import block_of, block_records
+from jaxatt.yardstick import leo4, worlds
+from jaxatt.yardstick.telemetry import Detector, Telemetry
+
+PACKETS, DAYS = 400, 256  # of the records that the checks play
+CUTS = 100, 300  # packets after which another day follows
+FORBIDDEN = ("callback", "infeed", "outfeed", "axis_index", "psum", "all_gather", "ppermute", "rng_uniform", "print")
+
+
+class Checks(NamedTuple):
+    """What the checks found of one detector; all True of one that may be ranked."""
+
+    causal: bool  # what comes later changes no verdict
+    alone: bool  # the order of the days changes none
+    repeats: bool  # the same input gives the same bits
+    pure: bool  # no callbacks, no effects, no axes of the machine
+    runs: bool  # records without a star sample, with zero gyros and with limited torques give a score or NaN
+    nanoseconds: float  # of a packet of one day, one core busy
+
+
+def example(batch: tuple = ()) -> Telemetry:
+    """A record of zeros and unit quaternions, float32."""
+    q = jnp.broadcast_to(jnp.array([1.0, 0, 0, 0], jnp.float32), (*batch, 4))
+    zeros = lambda *shape: jnp.zeros((*batch, *shape), jnp.float32)
+    return Telemetry(
+        zeros(5, 4), zeros(5, 4), q, jnp.ones(batch, bool), q, zeros(3), q, zeros(3), zeros(3), jnp.zeros(batch, jnp.int32)
+    )  # fmt: skip
+
+
+def state_of(detector: Detector):
+    """z at the start, floats in float32 as in a run."""
+    short = lambda a: a.astype(jnp.float32) if jnp.issubdtype(a.dtype, jnp.floating) else a
+    return jax.tree.map(lambda a: short(jnp.asarray(a)), detector.init(detector.params))
+
+
+@lru_cache
+def records() -> Telemetry:
+    """Public healthy telemetry, NumPy: packets and days in front."""
+    world, key = worlds.WORLDS["leo4"], jax.random.key(1)
+    days = worlds.days(world, key, np.arange(DAYS), None)
+    params = jax.tree.map(lambda a: np.asarray(a, np.float32), world.params)
+    run = compiled(block_records, 4)
+    blocks = [
+        run(leo4.system, _telemetry, PACKETS, 1, params, block_of(days, b), one_key(key), np.int32(b)) for b in range(2)
+    ]
+    return jax.tree.map(lambda *a: np.moveaxis(np.concatenate(a, axis=-1), -1, 1), *blocks)
+
+
+def _telemetry(log):
+    return log.telemetry
+
+
+def player(detector: Detector):
+    """A compiled function: records, packets and days in front, to verdicts of the same axes."""
+
+    def run(params, packets):
+        n = jax.tree.leaves(packets)[0].shape[1]
+        z = jax.tree.map(lambda a: jnp.broadcast_to(a[..., None], (*a.shape, n)), state_of(detector))
+        step = jax.vmap(detector.step, in_axes=(None, -1, -1), out_axes=-1)
+
+        def one(z, packet):
+            after, verdict = step(params, z, packet)
+            return jax.tree.map(lambda a, b: a.astype(b.dtype), after, z), verdict
+
+        last = jax.tree.map(lambda a: jnp.moveaxis(a, 1, -1), packets)
+        return jax.tree.map(lambda a: jnp.moveaxis(a, -1, 1), jax.lax.scan(one, z, last)[1])
+
+    return jitted(run)
+
+
+def checked(detector: Detector) -> Checks:
+    """Play public records and judge; seconds, most of them to compile.
+
+    Example:
+        >>> all(checked(BASELINES["chi2_10"])[:5])
+        True
+    """
+    play, whole = player(detector), records()
+    bits = lambda records: [np.asarray(a) for a in jax.tree.leaves(play(detector.params, records))]
+    same = lambda a, b: all(np.array_equal(x, y, equal_nan=True) for x, y in zip(a, b, strict=True))
+    first = bits(whole)
+    spent = []
+    for _ in range(3):
+        started = time.process_time()
+        again = bits(whole)
+        spent.append(time.process_time() - started)
+    causal = True
+    for cut in CUTS:
+        other = jax.tree.map(lambda a, cut=cut: np.concatenate([a[:cut], np.roll(a[cut:], 1, axis=1)]), whole)
+        causal &= same([a[:cut] for a in first], [a[:cut] for a in bits(other)])
+    order = np.random.default_rng(0).permutation(DAYS)
+    turned = bits(jax.tree.map(lambda a: a[:, order], whole))
+    alone = all(np.allclose(a[:, order], b, rtol=1e-5, atol=1e-6, equal_nan=True) for a, b in zip(first, turned))
+    try:
+        odd = bits(_odd(whole))
+        runs = not any(np.isinf(a).any() for a in odd[:1])
+    except FloatingPointError:
+        runs = False
+    cost = 1e9 * min(spent) / (PACKETS * DAYS)
+    return Checks(causal, alone, same(first, again), pure(detector), runs, cost)
+
+
+def _odd(whole: Telemetry) -> Telemetry:
+    """Valid records that a fault may bring: no star sample in some, gyros that read zero, torques at their limit."""
+    some = np.arange(DAYS)[None] % 3
+    blank = lambda a, which: np.where((some == which).reshape(1, DAYS, *[1] * (a.ndim - 2)), 0 * a, a)
+    limit = np.where((some == 2)[..., None, None], np.sign(whole.torque) * leo4.params.torque_max, whole.torque)
+    star = whole.star_valid & (some != 0)
+    return whole._replace(star_valid=star, gyro=blank(whole.gyro, 1), torque=limit.astype(np.float32))
+
+
+def pure(detector: Detector) -> bool:
+    """Whether init and step are free of callbacks, effects and axes of the machine."""
+    programs = _programs(detector)
+    names = {name for program in programs for name in _primitives(program.jaxpr)}
+    return not any(program.effects for program in programs) and not any(word in name for name in names for word in FORBIDDEN)  # fmt: skip
+
+
+def _programs(detector: Detector):
+    z = state_of(detector)
+    return jax.make_jaxpr(detector.init)(detector.params), jax.make_jaxpr(detector.step)(detector.params, z, example())
+
+
+def _primitives(jaxpr):
+    """Names of all primitives of a program, those within others too."""
+    for equation in jaxpr.eqns:
+        yield equation.primitive.name
+        for part in jax.tree.leaves(
+            list(equation.params.values()), is_leaf=lambda a: hasattr(a, "eqns") or hasattr(a, "jaxpr")
+        ):
+            inner = getattr(part, "jaxpr", part)
+            if hasattr(inner, "eqns"):
+                yield from _primitives(inner)
+
+
+def digest(detector: Detector) -> str:
+    """Hash of what a detector computes: programs of init and step without addresses, their constants, and the params."""
+    found = hashlib.sha256()
+    for program in _programs(detector):
+        found.update(re.sub(r"0x[0-9a-f]+", "", str(program)).encode())
+        for a in program.consts:
+            found.update(np.asarray(a).tobytes())
+    for a in jax.tree.leaves(detector.params):
+        found.update(f"{np.shape(a)} {np.asarray(a).dtype}".encode() + np.asarray(a).tobytes())
+    return found.hexdigest()
+
+
+def seed_of(world: worlds.World, detectors: Sequence[Detector], board: str) -> int:
+    """The test key's seed, 64 bits of a hash of the board, the world and all detectors: who adds a row draws fresh days."""
+    text = "".join(
+        [board, world.name, world.version, *(d.name + digest(d) for d in sorted(detectors, key=lambda d: d.name))]
+    )
+    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big")
+
+
+def key_of(seed: int):
+    """The key of 64 bits."""
+    return jax.random.wrap_key_data(jnp.array([seed >> 32, seed & 0xFFFFFFFF], jnp.uint32))
+
+
+def validated(detectors: Sequence[Detector]) -> tuple[Detector, ...]:
+    """The detectors, if they are some, of different names, and each gives a score and a blame of the right shape."""
+    detectors = tuple(detectors) if isinstance(detectors, Sequence) else ()
+    if not detectors:
+        check.refuse("detectors", "hold at least one Detector", "empty")
+    names = []
+    for i, d in enumerate(detectors):
+        check.kind(f"detectors[{i}]", d, Detector)
+        if d.name in names:
+            check.refuse("detectors", "have names that differ", f"{d.name!r} twice")
+        names.append(d.name)
+        _shapes(d)
+    return detectors
+
+
+def _shapes(d: Detector) -> None:
+    """Raise where a step does not give back the structure of z, and a score () and a blame (11,)."""
+    z = state_of(d)
+    out = jax.eval_shape(d.step, d.params, z, example())
+    if not (isinstance(out, tuple) and len(out) == 2 and hasattr(out[1], "score") and hasattr(out[1], "blame")):
+        raise TypeError(f"`{d.name}.step` must return z, Verdict, but it is {check.short(out)}.")
+    after, verdict = out
+    if jax.tree.structure(after) != jax.tree.structure(z):
+        raise TypeError(f"`{d.name}.step` must return z as it got it, but it is {jax.tree.structure(after)}.")
+    for path, a in jax.tree_util.tree_leaves_with_path(after):
+        b = dict(jax.tree_util.tree_leaves_with_path(z))[path]
+        if np.shape(a) != np.shape(b):
+            raise TypeError(f"`{d.name}.step` must return z{jax.tree_util.keystr(path)} of shape {np.shape(b)}, but it is {np.shape(a)}.")  # fmt: skip
+    for name, shape in (("score", ()), ("blame", (11,))):
+        if getattr(verdict, name).shape != shape:
+            raise TypeError(f"`{d.name}.step` must return a {name} of shape {shape}, but it is {getattr(verdict, name).shape}.")  # fmt: skip
