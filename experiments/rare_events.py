@@ -67,7 +67,7 @@ def lost_lock(params, scenario, now, log):
 
 
 def false_safe_mode(params, scenario, now, log):
-    """What drops the star tracker, over its threshold: in the Earth's shadow nothing is left to trust without it."""
+    """What drops the star tracker in the first logic, over its threshold: in the Earth's shadow nothing is left without it."""
     told = log.statistics
     return scores.peak(jnp.maximum(told.cross, told.nis_sum / params.limits.nis_sum), now.k >= ms.MASKED)
 
@@ -95,9 +95,10 @@ def studies() -> dict[str, Study]:
     still = op.scenario._replace(star=healthy, gyro=healthy)
     two_dead = ekf.scenario.gyro._replace(onset=np.array([20.0, 20.0, np.inf, np.inf]))
     sat = single(ms.params)
+    first_logic = sat._replace(limits=sat.limits._replace(arbiter=np.float32(0)))
     return {
         "observer_pd": Study(
-            "observer_pd: residual of a healthy day", "peak residual, 10 to 30 s", 1.0,
+            "observer_pd: residual of a healthy day", "peak residual, 10 to 30 s [MRP, rad/s]", 1.0,
             op.system, single(op.params), single(still), 300, peak_residual, 0.0040, 0.0044, (2**16, 10**7),
         ),
         "gyro_ekf": Study(
@@ -106,8 +107,8 @@ def studies() -> dict[str, Study]:
             0.0065 * DEG, 0.007 * DEG, (2**13, 10**6),
         ),
         "safe_mode": Study(
-            "microsat: healthy, in the Earth's shadow", "test of star samples over its threshold, 30 s", 1.0,
-            ms.system, sat, single(ms.scenario._replace(t0=2500.0)), 300, false_safe_mode, 1.0, 1.15, (2**15, 10**6),
+            "microsat, first logic: healthy, in the Earth's shadow", "test of star samples over its threshold, 30 s", 1.0,
+            ms.system, first_logic, single(ms.scenario._replace(t0=2500.0)), 300, false_safe_mode, 1.0, 1.15, (2**15, 10**6),
         ),
         "wheel": Study(
             "microsat: a wheel's friction grows by half", "time until the alarm [s]", 1.0,
@@ -236,7 +237,7 @@ def curves(report, known, found, counted) -> None:
         ax.errorbar(
             plain[-k - 1] / study.unit, p, [p - low, high - p], fmt="o", ms=3, color=COLOURS[1], label=f"{len(plain)} plain runs"
         )  # fmt: skip
-        ax.axvline(study.shipped / study.unit, color=GREY, linestyle=LINES[1], label="threshold")
+        ax.axvline(study.shipped / study.unit, color=GREY, linestyle=LINES[1], label="limit")
         ax.set(
             yscale="log",
             ylim=(0.3 * curve.p[-1], 2),
@@ -319,7 +320,7 @@ def common(report, known, found) -> None:
             title=f"microsat, safe mode: {name}", xlabel="time from the trip [s]", ylabel=f"{name} over its threshold"
         )
     for ax in axes:
-        ax.legend()
+        ax.legend(loc="upper left")
     report.figure("common", fig)
 
 

@@ -238,9 +238,9 @@ def log_t(estimates) -> tuple:
     return p, p / reach, np.minimum(p * reach, 1.0), cv
 
 
-def wilson(successes: int, trials: int) -> tuple[float, float]:
-    """Wilson's 95 % interval of a share, for shares that are not rare."""
-    z = 1.959963984540054
-    share, more = successes / trials, z * z / trials
-    middle, reach = share + more / 2, z * np.sqrt(share * (1 - share) / trials + more / trials / 4)
-    return float((middle - reach) / (1 + more)), float((middle + reach) / (1 + more))
+def wilson(successes, trials):
+    """Low and high end of Wilson's 95 % interval of a share, for shares that are not rare; arrays or numbers, NaN of no trial."""
+    k, n, z = np.asarray(successes, float), np.asarray(trials, float), 1.959963984540054
+    n, square = np.where(n > 0, n, np.nan), z * z
+    middle, reach = k + square / 2, z * np.sqrt(np.maximum(k * (n - k) / n + square / 4, 0))
+    return np.maximum(middle - reach, 0) / (n + square), np.minimum((middle + reach) / (n + square), 1)

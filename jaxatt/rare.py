@@ -145,7 +145,7 @@ def _loss(event: Event, pilot: Pilot, done: list[Population], looks: int, label,
     curve = Curve(pilot.grid, *log_t([one.curve for one in done])[:3])
     p, low, high, cv = (float(a) for a in log_t(by_repeat))
     if not len(pilot.levels):
-        low, high = wilson(round(p * repeats * n), repeats * n)
+        low, high = map(float, wilson(round(p * repeats * n), repeats * n))
     elif p == 0:
         low, high = 0.0, 3 / (repeats * n)
     some = [one for one in done if one.p > 0]

@@ -10,7 +10,7 @@ alarms an hour in each mode, and meets it with every fault of the catalogue on d
 screen: docs/yardstick.md. ``python -m jaxatt.yardstick board.json`` rebuilds a board and compares it.
 
 Its modules may import: yardstick, check, fields, clock, contract, compiling, vec, attitude, faults, noise, engine,
-sweeping, scores, detection, batching.
+sweeping, scores, loss, detection, batching.
 """
 
 from functools import cache

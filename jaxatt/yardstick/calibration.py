@@ -3,7 +3,7 @@
 The rate r belongs to windows of T = 600 s: P(no alarm in T) = exp(-r T). The threshold is that quantile of the largest
 score of healthy windows, whatever the scores' correlation in time; formulas for single samples miss the rate by orders.
 
-May import: harness, rules, telemetry, worlds, check.
+May import: harness, rules, telemetry, worlds, check, loss.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import jax
 import numpy as np
 
 from jaxatt import check
+from jaxatt.loss import wilson
 from jaxatt.yardstick import worlds
 from jaxatt.yardstick.harness import Found, run
 from jaxatt.yardstick.rules import validated
@@ -50,15 +51,6 @@ def threshold_of(maxima, rate: float) -> tuple[float, float, float]:
     with np.errstate(invalid="ignore"):
         found = float(np.quantile(maxima, level))
     return (float(maxima[-1]) if np.isnan(found) else found), float(maxima[at[0]]), float(maxima[at[1]])
-
-
-def wilson(k, n, z: float = 1.96) -> tuple[Any, Any]:
-    """Wilson's 95 % interval of a share from k of n."""
-    k, n = np.asarray(k, float), np.asarray(n, float)
-    n = np.where(n > 0, n, np.nan)
-    middle, square = (k + z * z / 2) / (n + z * z), z * z
-    half = z * np.sqrt(np.maximum(k * (n - k) / n + square / 4, 0)) / (n + square)
-    return np.maximum(middle - half, 0), np.minimum(middle + half, 1)
 
 
 def rate_of(k, n) -> tuple[Any, Any, Any]:

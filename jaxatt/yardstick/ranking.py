@@ -1,7 +1,7 @@
 """`rank`: calibrate detectors to one false-alarm rate, run the catalogue, compare them on common days.
 
 May import: baselines, bank, board, calibration, fitting,
-harness, metrics, rules, telemetry, worlds, check.
+harness, metrics, rules, telemetry, worlds, check, loss.
 """
 
 from __future__ import annotations
@@ -15,9 +15,10 @@ import jax
 import numpy as np
 
 from jaxatt import check
+from jaxatt.loss import wilson
 from jaxatt.yardstick import baselines, metrics, rules, worlds
 from jaxatt.yardstick.board import VERSION, Board, plain
-from jaxatt.yardstick.calibration import DISTINCT, Calibration, calibration, wilson, windows
+from jaxatt.yardstick.calibration import DISTINCT, Calibration, calibration, windows
 from jaxatt.yardstick.harness import HORIZON, Found, run
 from jaxatt.yardstick.rules import validated
 from jaxatt.yardstick.telemetry import Detector

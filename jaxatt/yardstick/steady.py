@@ -41,9 +41,10 @@ def steady(F, Q, H, R, S=None) -> Steady:
     weight = np.linalg.inv(R)
     A, G, P = (F - across @ weight @ H).T, H.T @ weight @ H, Q - across @ weight @ across.T
     for _ in range(40):
-        inner = np.linalg.inv(np.eye(n) + G @ P)
-        step = A.T @ P @ inner @ A
-        A, G, P = A @ inner @ A, G + A @ inner @ G @ A.T, P + step
+        with np.errstate(over="ignore", invalid="ignore"):  # of a filter that does not converge
+            inner = np.linalg.inv(np.eye(n) + G @ P)
+            step = A.T @ P @ inner @ A
+            A, G, P = A @ inner @ A, G + A @ inner @ G @ A.T, P + step
         if not np.isfinite(P).all():
             break
         if np.abs(step).max() <= 1e-10 * np.abs(P).max():
