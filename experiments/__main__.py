@@ -14,7 +14,7 @@ import sys
 from pathlib import Path
 
 from experiments.report import written
-from experiments.running import EXPERIMENTS, NAMES, STUDIES, prepare, run, side_by_side
+from experiments.running import EXPERIMENTS, LOOPS, NAMES, STUDIES, prepare, run, side_by_side
 
 
 def main() -> int:
@@ -31,12 +31,13 @@ def main() -> int:
     )
     args = parser.parse_args()
     study = args.names.pop() if args.names and args.names[-1] in STUDIES else ""
-    unknown = [name for name in args.names if name not in NAMES]
+    allowed = LOOPS if study else NAMES
+    unknown = [name for name in args.names if name not in allowed]
     if unknown:
-        parser.error(f"`NAME` must be one of {', '.join(NAMES)}, but it is {unknown[0]}.")
+        parser.error(f"`NAME` must be one of {', '.join(allowed)}, but it is {unknown[0]}.")
     if args.jobs < 1:
         parser.error(f"`--jobs` must be at least 1, but it is {args.jobs}.")
-    names = args.names or list(NAMES)
+    names = args.names or list(allowed)
     jobs = min(args.jobs, len(names))
     how = study, args.quick, args.out
     if jobs == 1:

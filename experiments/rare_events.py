@@ -140,7 +140,7 @@ def timed(f: Callable):
 
 def estimate(study: Study, seed: int, quick: bool, **other):
     """The loss of a study; flags are checked, not warned of."""
-    chains, repeats = 128, 4 if quick and study.system is not op.system else 8
+    chains, repeats = 128, 4 if quick and study.score is not peak_residual else 8
     ask: dict[str, Any] = dict(ticks=study.ticks, score=study.score, above=study.above, normals=study.normals)
     ask |= dict(chains=chains, repeats=repeats)
     with warnings.catch_warnings():
@@ -359,19 +359,19 @@ def tuned(report) -> None:
     )
     theta = np.log([330.0, 125.0])
 
-    h, repeats = 0.2, 8 if report.quick else 32
-    first = at(theta, 100, repeats=repeats)
+    first = at(theta, 100, **{} if report.quick else dict(repeats=32))
     told = slope(theta, first)
     report.note(f"tuned: {first} with the paper's gains; d ln P / d ln (k_q, k_w0) = {np.asarray(told.gradient)}")
-    for i, name in enumerate(("k_q", "k_w0")):
-        ends = [at(theta + sign * h * (np.arange(2) == i), 101 + i, repeats=repeats) for sign in (1, -1)]
+    h = 0.2
+    for i, name in enumerate(("k_q", "k_w0")) if not report.quick else ():
+        ends = [at(theta + sign * h * (np.arange(2) == i), 101 + i, repeats=32) for sign in (1, -1)]
         difference = np.log(ends[0].p / ends[1].p) / (2 * h)
         error = np.hypot(np.hypot(ends[0].cv, ends[1].cv) / (2 * h), float(told.error[i]))
         report.check(f"tuned: d ln P / d ln {name} against a central difference, +- 3 errors",
                      round(float(difference), 2), float(told.gradient[i]), 3 * float(error), "the same, by other means")  # fmt: skip
 
     path, p = [theta], [first.p]
-    for step in range(4 if report.quick else 8):
+    for step in range(2 if report.quick else 8):
         loss = at(path[-1], 200 + step)
         p.append(loss.p)
         if loss.p == 0 or not len(loss.levels):
@@ -380,7 +380,7 @@ def tuned(report) -> None:
         path.append(path[-1] - 0.25 * g / np.linalg.norm(g))
         report.note(f"tuned: step {step}: gains {np.exp(path[-2]).round(1)}, {loss.p:.2g}")
     best = path[int(np.argmin(p[1 : len(path)]))] if len(p) > 1 else theta
-    before, after = at(theta, 300, repeats=8), at(best, 301, repeats=8)
+    before, after = at(theta, 300), at(best, 301)
     report.note(f"tuned: fresh keys: {before}; with gains {np.exp(best).round(1)}: {after}")
     report.within("tuned: P with the paper's gains over P tuned, fresh keys, its lower end", 1.0, None,
                   before.low / max(after.high, 1e-300), "the intervals lie apart")  # fmt: skip

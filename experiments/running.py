@@ -10,6 +10,7 @@ import importlib
 import sys
 import time
 from concurrent.futures import Future, ProcessPoolExecutor
+from importlib.util import find_spec
 from multiprocessing import get_context
 from pathlib import Path
 from typing import NamedTuple
@@ -36,10 +37,11 @@ EXPERIMENTS = {
     "star_isolation": Experiment(70, 88, "roc"),
     "wheel_mrac": Experiment(30, 77, "loss_of_effectiveness"),
     "microsat": Experiment(90, 50, "reconfiguration"),
-    "rare_events": Experiment(60, 18, "curves"),
+    "rare_events": Experiment(45, 16, "curves"),
     "yardstick": Experiment(110, 38, "board"),
 }
 NAMES = tuple(EXPERIMENTS)
+LOOPS = tuple(name for name in NAMES if find_spec(f"jaxatt.loops.{name}"))  # which have studies and a campaign
 STUDIES = {"tune": "experiments.tuning"}  # words that may follow the names, and where the studies lie
 
 

@@ -5,7 +5,7 @@ import xarray as xr
 
 from benchmarks import tiny_campaign as tiny
 from experiments import campaigns
-from experiments.__main__ import NAMES
+from experiments.running import LOOPS
 from jaxatt.campaign import dataset, workers
 from jaxatt.campaign.draw import checked, drawn
 from jaxatt.engine import validated
@@ -74,7 +74,7 @@ def test_bad_words_are_refused(tmp_path, capsys):
         assert refused.value.code == 2 and message in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", LOOPS)
 def test_every_experiment_draws_scenarios_that_its_loop_accepts(name):
     this = checked(campaigns.campaign(name, 128))
     scenarios, inputs = drawn(this, 0, 128)

@@ -351,9 +351,9 @@ def test_the_command_refuses_what_it_does_not_know(words, wrong, monkeypatch, ca
 
 
 def test_every_paper_has_a_study_of_its_gains():
-    from experiments.__main__ import NAMES, STUDIES
+    from experiments.running import LOOPS, STUDIES
 
-    for name in NAMES:
+    for name in LOOPS:
         assert callable(importlib.import_module(f"{STUDIES['tune']}.{name}").run)
 
 
