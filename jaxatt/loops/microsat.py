@@ -514,7 +514,7 @@ def star_sample(params: Params, computer: Computer, arrived: Exposure) -> tuple[
     computer = computer._replace(belief=belief, rejected=rejected, nis=nis, sun=suns, field=fields, dof=dof)
     computer = computer._replace(lean=tuple(slid), silent=silent)
     threes, parts = jnp.sum(dof, axis=0) / 3, (jnp.sum(suns, axis=0), jnp.sum(fields, axis=0))
-    index = lambda table, count: jnp.asarray(table)[jnp.clip(count - 1, 0, len(CROSS) - 1).astype(int)]
+    index = lambda table, count: jnp.asarray(table, count.dtype)[jnp.clip(count - 1, 0, len(CROSS) - 1).astype(int)]
     cross = (parts[0] + parts[1]) / index(limits.cross, threes[0] + threes[1])
     over = [
         jnp.where(count > 0, jnp.maximum(part / index(CLEAN, count), (mean @ mean) / LEAN), jnp.inf)
