@@ -1,5 +1,7 @@
 """Abuse of what estimates small probabilities and looks at failures. A loss that others are asked of is made once."""
 
+from typing import Any
+
 import jax
 import numpy as np
 import pytest
@@ -40,7 +42,7 @@ def itself(theta):
     return theta
 
 
-ASK = dict(system=LOOP, params=PARAMS, scenario=SCENARIO, key=KEY, ticks=1, score=first, above=3.0)
+ASK: dict[str, Any] = dict(system=LOOP, params=PARAMS, scenario=SCENARIO, key=KEY, ticks=1, score=first, above=3.0)
 small = dict(chains=8, moves=5, repeats=4)
 VERBS = "probability", "design_point", "importance", "failure", "groups", "sensitivity"
 SIZES = st.one_of(st.just(8), whole)
