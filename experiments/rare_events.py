@@ -123,8 +123,8 @@ def studies() -> dict[str, Study]:
 def run(report) -> None:
     """All studies, what their failures look like, and the gain that is tuned."""
     known, found, counted = studies(), {}, {}
-    for name, study in known.items():
-        found[name], counted[name] = probability(report, name, study)
+    for i, (name, study) in enumerate(known.items()):
+        found[name], counted[name] = probability(report, name, study, 10 * i)
     curves(report, known, found, counted)
     observer(report, known["observer_pd"], found["observer_pd"])
     common(report, known, found)
@@ -171,11 +171,9 @@ def exceeding(curve, b):
     return [np.exp(np.interp(b, curve.b[met], np.log(a[met]))) for a in (curve.p, curve.low, curve.high)]
 
 
-def probability(report, name: str, study: Study):
+def probability(report, name: str, study: Study, seed: int):
     """The loss of a study and the plain runs beside it, with what they must agree in."""
-    seed = 10 * list(studies()).index(name)
     loss = estimate(study, seed, report.quick)
-    _, cpu = timed(lambda: loss if report.quick else estimate(study, seed + 1, False))  # again, now that it is compiled
     runs = study.plain[not report.quick]
     plain = counted_runs(study, min(runs, AT_ONCE), seed + 2)
     _, each = timed(lambda: counted_runs(study, 1024, seed + 3))
@@ -197,6 +195,7 @@ def probability(report, name: str, study: Study):
     )
     report.note(f"  {loss}; {needed / loss.runs:.2g} times fewer runs than plain sampling to the same spread")
     if not report.quick:
+        _, cpu = timed(lambda: estimate(study, seed + 1, False))  # again, now that it is compiled
         ratio = needed * each / 1024 / cpu
         report.note(f"  {cpu:.0f} CPU s, {1e3 * each / 1024:.2g} ms a plain run: {ratio:.2g} times less CPU time")
     return loss, plain

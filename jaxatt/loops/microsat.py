@@ -61,7 +61,7 @@ CROSS = np.array(  # threshold_quantile(1e-8, (3, 6, ... 24))
 )
 CLEAN = np.array([16.266236, 22.457744, 27.877165, 32.90949])  # threshold_quantile(1e-3, (3, 6, 9, 12))
 SHARE = 1 / 120  # of a new residual in the means of Sun and field: 30 s of samples
-LEAN = 16.266236 * SHARE / (2 - SHARE)  # threshold_quantile(1e-3, 3) of such a mean of white residuals
+LEAN = float(CLEAN[0]) * SHARE / (2 - SHARE)  # the same of such a mean of white residuals
 NULL = np.array([0.5, -0.5, 0.5, -0.5])  # wheel momenta without a resultant
 TRACKER = StarTracker(
     boresight=Vec3(0.0, 1.0, 0.0), across=Vec3(0.0, 0.0, 1.0),
@@ -503,8 +503,8 @@ def star_sample(params: Params, computer: Computer, arrived: Exposure) -> tuple[
     sun = (known(arrived.sun, zeros()) - quat_to_body(q, sky.sun)) / params.std_sun
     field = (known(arrived.field, zeros()) - quat_to_body(q, sky.field)) / params.std_field
     there = jnp.stack([sun_there, field_there])
-    now = jnp.where(sun_there, sun @ sun, 0), jnp.where(field_there, field @ field, 0)
-    one = jnp.minimum(met.nis, limits.gate), *now, jnp.where(there, 3.0, 0)
+    squares = jnp.where(sun_there, sun @ sun, 0), jnp.where(field_there, field @ field, 0)
+    one = jnp.minimum(met.nis, limits.gate), *squares, jnp.where(there, 3.0, 0)
     lines = computer.nis, computer.sun, computer.field, computer.dof
     nis, suns, fields, dof = (jnp.where(came, pushed(line, new), line) for line, new in zip(lines, one))
     slid = [
@@ -514,7 +514,7 @@ def star_sample(params: Params, computer: Computer, arrived: Exposure) -> tuple[
     computer = computer._replace(belief=belief, rejected=rejected, nis=nis, sun=suns, field=fields, dof=dof)
     computer = computer._replace(lean=tuple(slid), silent=silent)
     threes, parts = jnp.sum(dof, axis=0) / 3, (jnp.sum(suns, axis=0), jnp.sum(fields, axis=0))
-    index = lambda table, count: jnp.asarray(table, count.dtype)[jnp.clip(count - 1, 0, len(CROSS) - 1).astype(int)]
+    index = lambda table, count: jnp.asarray(table, count.dtype)[jnp.clip(count - 1, 0, len(table) - 1).astype(int)]
     cross = (parts[0] + parts[1]) / index(limits.cross, threes[0] + threes[1])
     over = [
         jnp.where(count > 0, jnp.maximum(part / index(CLEAN, count), (mean @ mean) / LEAN), jnp.inf)
@@ -534,7 +534,7 @@ def judge(params: Params, now, computer: Computer, star: Sample) -> Computer:
     alone = (computer.rejected >= limits.elimination) | (many & (computer.rejected < limits.persistent))
     # one of Sun and field that disagrees alone, while nothing is strange, is odd itself (choice 10); a gyro that departs
     # from the momentum has a bias that followed the star tracker, or torquers that a wrong field drives
-    both = both_seen(star)
+    both = (star.sun < jnp.inf) & (star.field < jnp.inf)
     sun_alone, field_alone = both & (star.field <= 1), both & (star.sun <= 1)
     sure = (limits.arbiter <= 0) | strange | out.gyro_out | (both & ~sun_alone & ~field_alone)
     accused = disagree & (sure | (sun_alone & guilty))
@@ -557,11 +557,6 @@ def judge(params: Params, now, computer: Computer, star: Sample) -> Computer:
         sun_out=out.sun_out | left[0], field_out=out.field_out | left[1],
     )  # fmt: skip
     return computer._replace(belief=belief, bias=bias, odd=count, verdict=verdict)
-
-
-def both_seen(star: Sample):
-    """Whether both Sun and field were compared with the star sample."""
-    return (star.sun < jnp.inf) & (star.field < jnp.inf)
 
 
 def backup(params: Params, now, computer: Computer, y: Readings) -> Mekf:

@@ -2,7 +2,7 @@
 
 z = L^-1 r of the residuals r (`telemetry.residuals_step`), L L' = Sigma, their covariance in healthy runs.
 
-May import: leo4, telemetry, products, vec, batching, detection.
+May import: leo4, telemetry, products, vec, attitude, batching, detection.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxatt.attitude import mrp_from_quat, mrp_rate, mrp_rate_transposed
 from jaxatt.batching import in_lanes
 from jaxatt.detection import Cusum, cusum, window_sum
 from jaxatt.vec import Quat, Vec3, cross, norm
@@ -64,21 +65,12 @@ def mrp_init(params: ObserverParams) -> Observer:
     return Observer(three, three, zero)
 
 
-def _rate_map(q: Vec3, w: Vec3, sign: int = 1) -> Vec3:
-    """G(q) w, or with sign -1 its transpose, of MRP."""
-    return ((1 - q @ q) * w + (2 * sign) * cross(q, w) + (2 * (q @ w)) * q) / 4
-
-
-def _mrp(p: Quat) -> Vec3:
-    return jnp.where(p.w < 0, -1, 1) / (1 + jnp.abs(p.w)) * p.v
-
-
 def mrp_step(params: ObserverParams, z: Observer, telemetry: Telemetry) -> tuple[Observer, Verdict]:
     """Yun & Kang (2020), eq. (7), by Euler's rule at 10 Hz with the star sample held; the largest |xi| of five ticks."""
     first = z.seen == 0
-    begun = _mrp(Quat.of(telemetry.attitude)), leo4.rate_of(telemetry.gyro[0]) - Vec3.of(telemetry.bias)
+    begun = mrp_from_quat(Quat.of(telemetry.attitude)), leo4.rate_of(telemetry.gyro[0]) - Vec3.of(telemetry.bias)
     q, w = (Vec3(*(jnp.where(first, a, b) for a, b in zip(new, old))) for new, old in zip(begun, z[:2]))
-    measured = _mrp(Quat.of(telemetry.star))
+    measured = mrp_from_quat(Quat.of(telemetry.star))
     x_q = measured - q
     worst, ratio = 0.0 * z.seen, 0.0 * z.seen
     for i in range(leo4.TICKS):
@@ -87,8 +79,8 @@ def mrp_step(params: ObserverParams, z: Observer, telemetry: Telemetry) -> tuple
         size = jnp.sqrt(x_q @ x_q + x_w @ x_w)
         ratio = jnp.where(size > worst, norm(x_q) / norm(x_w), ratio)
         worst = jnp.where(size > worst, size, worst)
-        u = leo4.summed(telemetry.torque[i]) + params.beta * x_w + _rate_map(at, x_q, -1)
-        q_next = q + leo4.DT * _rate_map(at, w)
+        u = leo4.summed(telemetry.torque[i]) + params.beta * x_w + mrp_rate_transposed(at, x_q)
+        q_next = q + leo4.DT * mrp_rate(at, w)
         if i == 0:
             q_next = q_next + (params.alpha * leo4.PACKET) * x_q
         q, w = q_next, w + leo4.DT * (leo4.INVERSE @ (u - cross(w, leo4.INERTIA @ y)))

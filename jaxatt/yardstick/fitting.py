@@ -1,7 +1,7 @@
 """The baselines fitted to fault-free telemetry of the tuning key, which is public: ``jax.random.key(0)``.
 
 May import: leo4, telemetry, worlds, baselines, bank, check, compiling,
-noise, engine, sweeping.
+contract, noise, engine, sweeping.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import numpy as np
 
 from jaxatt import check
 from jaxatt.compiling import compiled
+from jaxatt.contract import no_check
 from jaxatt.noise import BLOCK, one_key
 from jaxatt.sweeping import block_of, block_records
 from jaxatt.yardstick import bank, baselines, leo4, worlds
@@ -48,11 +49,7 @@ def _tick(params, scenario, now, x, z, noise):
     return x, (world, state, recent), (r, recent[9], sum(recent[i] for i in range(10)) / 10)
 
 
-def _unchecked(params, scenario):
-    """Days are drawn, not typed."""
-
-
-_SYSTEM = leo4.system._replace(init=_init, tick=_tick, check=_unchecked)
+_SYSTEM = leo4.system._replace(init=_init, tick=_tick, check=no_check)
 
 
 def _both(log):

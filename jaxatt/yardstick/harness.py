@@ -4,7 +4,7 @@ The tallies of a detector: its largest score in the window, its first alarm afte
 its blame at the alarm and ten seconds later, the pointing error until the alarm, episodes of alarms. Several detectors
 run in one sweep and cost one simulation. The score of a packet counts at its stamp, t = 0 at the window's start.
 
-May import: leo4, telemetry, worlds, contract, scores, sweeping.
+May import: leo4, metrics, telemetry, worlds, contract, scores, sweeping.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxatt import scores
-from jaxatt.contract import System
+from jaxatt.contract import System, no_check
 from jaxatt.sweeping import sweep
 from jaxatt.yardstick import leo4, worlds
+from jaxatt.yardstick.metrics import HORIZON
 from jaxatt.yardstick.telemetry import Detector
 from jaxatt.yardstick.worlds import PACKETS, WARMUP, World
 
 LATER = 10.0  # [s] after an alarm at which the blame is read again
-HORIZON = 60.0  # [s] after which a delay counts no further
 QUIET = 60.0  # [s] that end an episode of alarms
 SIXTHS = 6
 
@@ -107,11 +107,7 @@ def watched(system: System, steps: tuple) -> System:
     def flow(params: Params, scenario, t, x, z):
         return system.flow(params.world, scenario, t, x, z[0])
 
-    return system._replace(init=init, tick=tick, flow=flow, check=_unchecked)
-
-
-def _unchecked(params, scenario):
-    """Days are drawn, not typed."""
+    return system._replace(init=init, tick=tick, flow=flow, check=no_check)
 
 
 def score(params: Params, scenario, now, told: Told) -> Found:

@@ -7,9 +7,11 @@ May import: nothing of ours.
 
 from __future__ import annotations
 
+from math import erfc, exp, pi, sqrt
+
 import numpy as np
 
-HORIZON = 60.0  # [s]
+HORIZON = 60.0  # [s] after which a delay counts no further
 ISOLATION_FLOOR = 0.01
 
 
@@ -123,8 +125,6 @@ def ranks(difference, error, level: float = 0.05) -> np.ndarray:
     """1 + number of rows that are better after Holm's correction over all pairs; equal ranks are ties."""
     n = len(difference)
     pairs = [(a, b) for a in range(n) for b in range(a)]
-    from math import erfc
-
     z = [abs(difference[p]) / error[p] if error[p] > 0 else (np.inf if difference[p] else 0.0) for p in pairs]
     p_values = np.array([erfc(value / np.sqrt(2)) for value in z])
     better = np.zeros((n, n), bool)
@@ -148,7 +148,5 @@ def time_dependent(sixths) -> float:
         return 1.0
     mean = apart.mean(0)
     statistic = float(mean @ np.linalg.solve(spread, mean))
-    from math import erfc, exp, pi, sqrt
-
     x = statistic  # survival of chi-square of five degrees, in closed form
     return erfc(sqrt(x / 2)) + sqrt(2 * x / pi) * exp(-x / 2) * (1 + x / 3)

@@ -2,7 +2,7 @@
 
 In closed form of the seven residuals taken as white, which the dynamics are not quite: a row may lie 5 % below.
 
-May import: bank, leo4, telemetry.
+May import: bank, leo4, metrics, telemetry.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import numpy as np
 
 from jaxatt.yardstick import leo4
 from jaxatt.yardstick.bank import signatures
+from jaxatt.yardstick.metrics import HORIZON
 from jaxatt.yardstick.telemetry import STD
 
 # kind -> its channels and the size of one unit of the catalogue in SI units
@@ -21,7 +22,7 @@ STEPS = {
     "star_bias": (slice(4, 7), leo4.SECOND),
     "wheel_offset": (slice(7, 11), 1e-3),
 }
-PROBABILITY, HORIZON = 0.95, 60.0
+PROBABILITY = 0.95
 _NORMAL = NormalDist()
 
 

@@ -19,7 +19,8 @@ from jaxatt.loss import wilson
 from jaxatt.yardstick import baselines, metrics, rules, worlds
 from jaxatt.yardstick.board import VERSION, Board, plain
 from jaxatt.yardstick.calibration import DISTINCT, Calibration, calibration, windows
-from jaxatt.yardstick.harness import HORIZON, Found, run
+from jaxatt.yardstick.harness import Found, run
+from jaxatt.yardstick.metrics import HORIZON
 from jaxatt.yardstick.rules import validated
 from jaxatt.yardstick.telemetry import Detector
 from jaxatt.yardstick.worlds import CATALOGUE, HELD_OUT, MISMATCH, PAIRS, SIZED, WORLDS, World
