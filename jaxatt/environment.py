@@ -3,11 +3,13 @@
 Everything is in one inertial frame, the mean equator and equinox of date (that of SGP4 and of Greenwich mean sidereal
 time; J2000 is .37 deg away in 2026). `jaxatt.orbit` makes the columns.
 
-May import: check, vec.
+May import: check, vec, compiling.
 """
 
 from __future__ import annotations
 
+from functools import reduce
+from operator import add
 from typing import Annotated, Any, NamedTuple
 
 import jax
@@ -16,6 +18,7 @@ import numpy as np
 
 from jaxatt import check
 from jaxatt.check import finite, not_negative, positive, share
+from jaxatt.compiling import shared
 from jaxatt.vec import Vec3, norm
 
 
@@ -76,19 +79,19 @@ def at(table: Table, t) -> Surroundings:
 
     Before and after the span of the table the values at its ends.
     """
-    table = jax.tree.map(jnp.asarray, table)
-    rows = table.lit.shape[0]
-    u = (t - table.start) / table.step
-    i = jnp.clip(jnp.floor(u), 1, rows - 3)
+    columns = [*table.field, *table.sun, *table.r, *table.v, table.lit, table.density]
+    rows = jnp.stack(columns, axis=-1)  # here, lest every tick does it: what does not change leaves the loop over ticks
+    return shared(_between, table.start, table.step, rows, t)
+
+
+def _between(start, step, rows, t) -> Surroundings:
+    """`at`, of the columns side by side (rows, 14), so that four rows are one piece of memory."""
+    u = (t - start) / step
+    i = jnp.clip(jnp.floor(u), 1, len(rows) - 3)
     s = jnp.clip(u - i, 0, 1)
-    i = i.astype(int)
+    four = jax.lax.dynamic_slice_in_dim(rows, i.astype(int) - 1, 4)
     weights = -s + s * s * (2 - s), 2 - s * s * (5 - 3 * s), s + s * s * (4 - 3 * s), s * s * (s - 1)
-
-    def cubic(column):
-        return 0.5 * sum(w * column[i + k] for k, w in enumerate(weights, -1))
-
-    def line(column):
-        return column[i] + s * (column[i + 1] - column[i])
-
-    field, sun, r, v = (Vec3(*map(cubic, a)) for a in (table.field, table.sun, table.r, table.v))
-    return Surroundings(field, sun / norm(sun), line(table.lit), r, v, line(table.density))
+    cubic = 0.5 * reduce(add, (w * row for w, row in zip(weights, four)))
+    lit, density = four[1, 12:] + s * (four[2, 12:] - four[1, 12:])
+    field, sun, r, v = (Vec3(*cubic[k : k + 3]) for k in (0, 3, 6, 9))
+    return Surroundings(field, sun / norm(sun), lit, r, v, density)

@@ -355,7 +355,7 @@ def sense(params: Params, scenario: Scenario, now, x: X, z: Z, noise) -> SensorS
     tachometers 4.
     """
     last, before = z.sensors, z.sensors.readings
-    orbit = shared(at, params.table, scenario.t0 + now.t)
+    orbit = at(params.table, scenario.t0 + now.t)
     first, exposed = now.k == 0, due(now.k, *STAR)
     turn = where(first, now.dt * x.w, x.theta - last.theta)  # nothing lies before the first tick
     walk = noise[3:6] * jnp.where(first, 0, 1)
@@ -565,8 +565,12 @@ def backup(params: Params, now, computer: Computer, y: Readings) -> Mekf:
     due_now = (out.star_out | (computer.silent * now.dt > params.limits.patience)) & (now.k % SECOND == 0)
     good = (y.orbit.lit > SEEN) & ~out.sun_out, ~out.field_out
     sun, field = (a._replace(valid=a.valid & due_now & use) for a, use in zip((y.sun, y.field), good))
-    belief = update_vector(computer.belief, sun, y.orbit.sun, params.std_sun)[0]
-    return update_vector(belief, field, y.orbit.field, params.std_field)[0]
+    seen = (sun, y.orbit.sun, params.std_sun), (field, y.orbit.field, params.std_field)
+    one = lambda belief, a: (
+        update_vector(belief, *a)[0],
+        None,
+    )  # scanned: the program holds one update in place of two
+    return jax.lax.scan(one, computer.belief, jax.tree.map(lambda *a: jnp.stack(a), *seen))[0]
 
 
 def wheels_expected(params: Params, computer: Computer):
