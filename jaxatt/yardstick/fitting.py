@@ -77,11 +77,14 @@ def _public() -> Healthy:
 
 
 def pca_params(features, means) -> baselines.PcaParams:
-    """Plane and limits of the ten packets' means, standardised by the features of a packet; (n, packets, 13) both."""
+    """Plane and limits; features of packets and the means of ten, (n, packets, 13) both.
+
+    Standardised by the spread of the means; plane and variances are those of the packets, limits those of the means.
+    """
     single, flat = (np.asarray(a, float).reshape(-1, a.shape[-1]) for a in (features, means))
-    mean, std = single.mean(0), single.std(0)
-    z = (flat - mean) / std
-    values, vectors = np.linalg.eigh(z.T @ z / len(z))
+    mean, std = single.mean(0), flat.std(0)
+    packets, z = (single - mean) / std, (flat - mean) / std
+    values, vectors = np.linalg.eigh(packets.T @ packets / len(packets))
     values, vectors = values[::-1], vectors[:, ::-1]
     k = int(np.searchsorted(np.cumsum(values) / values.sum(), SHARE)) + 1
     main = vectors[:, :k].T / np.sqrt(values[:k, None])
