@@ -5,13 +5,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from experiments.yardstick import ewma_at_rate, ewma_central
 from jaxatt import rerun, scores, simulate
 from jaxatt.yardstick import (
     Detector,
     Verdict,
     bank,
     baselines,
+    calibrate,
     calibration,
+    descent,
+    harness,
     leo4,
     metrics,
     oracle,
@@ -21,7 +25,7 @@ from jaxatt.yardstick import (
     worlds,
 )
 from jaxatt.yardstick.board import differences
-from jaxatt.yardstick.harness import Found, run
+from jaxatt.yardstick.harness import Found, Softly, run, slopes
 from jaxatt.yardstick.products import correlations, product
 from jaxatt.yardstick.steady import steady
 from jaxatt.yardstick.telemetry import STD
@@ -328,6 +332,74 @@ def test_a_threshold_is_the_quantile_of_run_maxima():
     assert low < h < high and h == pytest.approx(-np.log(1 - np.exp(-1 / 60)), rel=0.05)
     rate, least, most = calibration.rate_of(200, 12_000)
     assert least < rate < most and rate == pytest.approx(0.1008, rel=1e-3)
+
+
+@pytest.mark.short
+def test_a_gradient_at_a_fixed_rate_is_that_of_central_differences():
+    """An EWMA of white noise: 12 000 windows, a rate at which every tenth has an alarm; common noise."""
+    how = jax.random.key(0), 12_000, 600, 1.2
+    here, central = ewma_at_rate(0.1, *how), ewma_central(0.1, 0.02, *how)
+    assert here["total"] == pytest.approx(central, rel=0.1)
+    assert here["slope"] > 4 * here["error"] and here["total"] > 1.2 * here["partial"]  # the threshold's part matters
+
+
+def test_the_slope_of_a_threshold_is_that_of_the_maxima_next_to_it():
+    rng = np.random.default_rng(8)
+    maxima = rng.exponential(size=4000)
+    h, *_ = calibration.threshold_of(maxima, 1.0)
+    slope, error = calibration.threshold_slope(maxima, np.stack([maxima, np.ones(4000)], 1), h)
+    np.testing.assert_allclose(slope, [h, 1.0], atol=3 * error[0])  # M = x M0 has dh/dx = h
+    assert error[1] == 0
+
+
+def scaled(x):
+    return (MINE.params * x[0],)
+
+
+@pytest.mark.short
+def test_slopes_of_a_score_that_is_scaled_are_the_score(monkeypatch):
+    monkeypatch.setattr(harness, "PACKETS", 700)
+    days = worlds.days(WORLD, KEY, np.arange(4), ("star_bias", 65.2))
+    days = days._replace(star=days.star._replace(onset=np.where(np.isfinite(days.star.onset), 310.0, np.inf)))
+    told, moved = slopes(WORLD, [MINE], KEY, days, [1.0], scaled, threshold=[[40.0, 40.0]], width=4.0)
+    assert told.peak.shape == (4, 1) and moved.peak.shape == (4, 1, 3)
+    np.testing.assert_allclose(moved.peak[..., 0], told.peak, rtol=1e-5)
+    assert not moved.peak[..., 1:].any()
+    hold, slew = moved.delay[:, 0, 1:].T
+    assert (hold[::2] > 0).all() and (slew[1::2] > 0).all() and not hold[1::2].any() and not slew[::2].any()
+    assert (told.delay > 0).all() and (told.delay < 10).all()
+    # x s - h = x (s - h / x): the delay at (x, h) is that at (1, h / x) of a width over x
+    more, _ = slopes(WORLD, [MINE], KEY, days, [1.25], scaled, threshold=[[50.0, 50.0]], width=5.0)
+    np.testing.assert_allclose(more.delay, told.delay, rtol=1e-3)
+
+
+def test_a_calibration_tells_how_its_threshold_moves(monkeypatch):
+    """Of made-up windows whose largest score is x[0] times an exponential one, the threshold is as much of its slope."""
+    monkeypatch.setattr(calibration, "run", made_up)
+
+    def softly(world, rows, key, days, numbers, params_of, **_):
+        peak = made_up(world, rows, key, days).peak
+        slope = np.stack([peak / numbers[0], 0 * peak, 0 * peak], axis=-1)
+        return Softly(peak, None), Softly(slope, None)
+
+    monkeypatch.setattr(calibration, "slopes", softly)
+    found = calibrate(
+        WORLD, [MINE, MINE._replace(name="two")], KEY, hours=400, gradient=([2.0], lambda x: (x[0], x[0]))
+    )
+    assert found.slope.shape == found.slope_error.shape == (2, 2, 1)
+    assert (np.abs(found.slope[..., 0] - found.threshold / 2) < 4 * found.slope_error[..., 0]).all()
+    assert calibrate(WORLD, [MINE, MINE._replace(name="two")], KEY, hours=400).slope is None
+    with pytest.raises(TypeError, match="must return a tuple of params, one a detector"):
+        calibrate(WORLD, [MINE], KEY, gradient=([2.0], lambda x: x[0]))
+    with pytest.raises(ValueError, match=r"`gradient\[0\]` must be finite numbers"):
+        calibrate(WORLD, [MINE], KEY, gradient=([np.nan], scaled))
+
+    monkeypatch.setattr(descent, "slopes", lambda *a, threshold=None, width=1.0: tuple(
+        s._replace(delay=s.peak) for s in softly(*a)))  # fmt: skip
+    step = descent.at_fixed_rate(WORLD, MINE, KEY, [2.0], scaled, hours=400, days=2)
+    np.testing.assert_allclose(step.gradient, step.partial)  # the made-up delay knows no threshold
+    np.testing.assert_allclose(step.partial, step.cost / 2)
+    assert step.slope.shape == (2, 1) and step.threshold.shape == (2,)
 
 
 def test_isolation_gives_the_even_guess_ln_of_one_in_eleven():

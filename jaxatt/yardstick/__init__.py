@@ -10,7 +10,7 @@ alarms an hour in each mode, and meets it with every fault of the catalogue on d
 screen: docs/yardstick.md. ``python -m jaxatt.yardstick board.json`` rebuilds a board and compares it.
 
 Its modules may import: yardstick, check, fields, clock, contract, compiling, vec, attitude, faults, noise, engine,
-sweeping, scores, loss, detection, batching.
+sweeping, scores, soft_scores, loss, detection, batching.
 """
 
 from functools import cache
@@ -18,6 +18,7 @@ from importlib import import_module
 
 from jaxatt.yardstick.board import Board
 from jaxatt.yardstick.calibration import Calibration, calibrate
+from jaxatt.yardstick.descent import at_fixed_rate
 from jaxatt.yardstick.fitting import NAMES, tune
 from jaxatt.yardstick.leo4 import Telemetry
 from jaxatt.yardstick.ranking import rank
@@ -35,6 +36,7 @@ __all__ = [
     "Telemetry",
     "Verdict",
     "World",
+    "at_fixed_rate",
     "calibrate",
     "rank",
     "residuals_init",

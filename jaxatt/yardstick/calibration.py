@@ -2,13 +2,14 @@
 
 The rate r belongs to windows of T = 600 s: P(no alarm in T) = exp(-r T). The threshold is that quantile of the largest
 score of healthy windows, whatever the scores' correlation in time; formulas for single samples miss the rate by orders.
+It has a gradient: as the numbers of a detector change, the threshold moves with the largest scores that lie next to it.
 
 May import: harness, rules, telemetry, worlds, check, loss.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -17,13 +18,14 @@ import numpy as np
 from jaxatt import check
 from jaxatt.loss import wilson
 from jaxatt.yardstick import worlds
-from jaxatt.yardstick.harness import Found, run
+from jaxatt.yardstick.harness import Found, run, slopes
 from jaxatt.yardstick.rules import validated
 from jaxatt.yardstick.telemetry import Detector
 from jaxatt.yardstick.worlds import WINDOW, World
 
 HOURS = WINDOW / 3600  # of a window
 DISTINCT = 1000  # run maxima below which a rate is an interval
+NEAREST = 0.06  # share of the windows that tell how the threshold moves: those with a largest score next to it
 
 
 class Calibration(NamedTuple):
@@ -40,6 +42,8 @@ class Calibration(NamedTuple):
     distinct: Any  # (detectors, modes) how many different run maxima there were
     reachable_low: Any  # [1/h] rates next to the wanted one that a threshold can have; both the same where all can
     reachable_high: Any
+    slope: Any = None  # (detectors, modes, k) gradient of the threshold, where one was asked for
+    slope_error: Any = None  # its standard error
 
 
 def threshold_of(maxima, rate: float) -> tuple[float, float, float]:
@@ -51,6 +55,20 @@ def threshold_of(maxima, rate: float) -> tuple[float, float, float]:
     with np.errstate(invalid="ignore"):
         found = float(np.quantile(maxima, level))
     return (float(maxima[-1]) if np.isnan(found) else found), float(maxima[at[0]]), float(maxima[at[1]])
+
+
+def threshold_slope(maxima, slopes, threshold: float, share: float = NEAREST) -> tuple[np.ndarray, np.ndarray]:
+    """Gradient of a threshold and its standard error, (k,) each: dh/dx = E[dM/dx | M = h].
+
+    maxima: (n,) largest scores M; slopes: (n, k) their gradients dM/dx. The mean is over the ``share`` of the windows whose
+    maxima are nearest to h in order, as many below as above: fewer windows where there are not so many above.
+    """
+    maxima, slopes = np.asarray(maxima, float), np.asarray(slopes, float)
+    order, n = np.argsort(maxima, kind="stable"), len(maxima)
+    below = int(np.sum(maxima <= threshold))
+    half = max(1, min(round(share * n / 2), below, n - below))
+    near = order[max(0, below - half) : below + half]
+    return slopes[near].mean(0), slopes[near].std(0, ddof=1) / np.sqrt(len(near))
 
 
 def rate_of(k, n) -> tuple[Any, Any, Any]:
@@ -65,8 +83,9 @@ def windows(world: World, detectors: Sequence[Detector], key, n: int, progress: 
 
 
 def calibrate(
-    world: World, detectors: Sequence[Detector], key, *, hours: float = 4000, rate: float = 0.1, progress: bool = False
-):
+    world: World, detectors: Sequence[Detector], key, *, hours: float = 4000, rate: float = 0.1,
+    gradient: tuple[Any, Callable] | None = None, progress: bool = False,
+) -> Calibration:  # fmt: skip
     """Thresholds of a false-alarm rate, and the rate on as many fresh windows.
 
     Args:
@@ -75,31 +94,64 @@ def calibrate(
         key: the test key; days to calibrate on and to validate on are ``fold_in(key, 1)`` and ``fold_in(key, 2)``.
         hours: of windows to calibrate on, both modes together, and as many again to validate.
         rate: wanted [1/h].
+        gradient: numbers x (k,), and a function of them that gives the params of all detectors, a tuple: the thresholds
+            are those of these params, and come with their gradient by x. 2000 hours or more: it is a mean over the few
+            windows whose largest score is next to the threshold.
         progress: show a bar.
 
     Returns:
-        `Calibration`.
+        `Calibration`; its ``slope`` and ``slope_error`` are None without ``gradient``.
 
     Raises:
-        ValueError: no detector, two of one name, hours < 100, a rate outside (0, 6).
-        TypeError: a detector whose step does not return a `Verdict` of a score () and a blame (11,).
+        ValueError: no detector, two of one name, hours < 100, a rate outside (0, 6), numbers of another shape than (k,).
+        TypeError: a detector whose step does not return a `Verdict` of a score () and a blame (11,); a function that
+            gives no params for each detector.
 
     Example:
         >>> found = calibrate(WORLDS["leo4"], [BASELINES["glr"]], jax.random.key(7), hours=400)
+        >>> slack = lambda x: (BASELINES["cusum"].params._replace(slack=x[0]),)
+        >>> found = calibrate(WORLDS["leo4"], [BASELINES["cusum"]], jax.random.key(7), gradient=([0.25], slack))
     """
+    detectors = tuple(detectors) if isinstance(detectors, Sequence) else ()
+    if gradient is not None:
+        detectors = _with_numbers(detectors, gradient)
     detectors = validated(detectors)
     check.above("hours", check.number("hours", hours), 99.999, "below it no rate of .1/h is known to a third")
     check.between("rate", check.number("rate", rate), 0, 6, "one alarm a window")
-    n = 2 * int(np.ceil(hours / (2 * HOURS) - 1e-9))
+    n, modes = 2 * int(np.ceil(hours / (2 * HOURS) - 1e-9)), len(world.modes)
     healthy = windows(world, detectors, jax.random.fold_in(key, 1), n, progress)
     fresh = windows(world, detectors, jax.random.fold_in(key, 2), n, progress)
-    return calibration(len(world.modes), healthy, fresh.peak, rate)
+    found = calibration(modes, healthy, fresh.peak, rate)
+    if gradient is None:
+        return found
+    days = worlds.days(world, jax.random.fold_in(key, 1), np.arange(n), None)
+    softly, moved = slopes(world, detectors, jax.random.fold_in(key, 1), days, *gradient)
+    each = [[threshold_slope(softly.peak[m::modes, d], moved.peak[m::modes, d, :-modes], h) for m, h in enumerate(row)]
+            for d, row in enumerate(found.threshold)]  # fmt: skip
+    slope, error = np.moveaxis(np.array(each), 2, 0)
+    return found._replace(slope=slope, slope_error=error)
+
+
+def _with_numbers(detectors: tuple[Detector, ...], gradient) -> tuple[Detector, ...]:
+    """The detectors with the params that the numbers give."""
+    if not isinstance(gradient, tuple) or len(gradient) != 2:
+        check.refuse("gradient", "be None or numbers and a function of them, a tuple", check.short(gradient))
+    numbers, params_of = gradient
+    check.function("gradient[1]", params_of)
+    x = check.real("gradient[0]", numbers)
+    if x.ndim != 1 or not x.size or not np.isfinite(x).all():
+        check.refuse("gradient[0]", "be finite numbers of shape (k,)", check.short(numbers))
+    given = params_of(x.astype(np.float32))
+    if not isinstance(given, tuple) or len(given) != len(detectors):
+        raise TypeError(f"`gradient[1]` must return a tuple of params, one a detector, but it is {check.short(given)}.")
+    return tuple(d._replace(params=p) for d, p in zip(detectors, given))
 
 
 def calibration(modes: int, healthy: Found, fresh, rate: float) -> Calibration:
     """`calibrate` of windows that were run; fresh: (n, detectors) largest scores."""
     peak = np.asarray(healthy.peak)
-    rows: dict[str, list] = {name: [] for name in Calibration._fields}
+    names = ("threshold", "low", "high", "rate", "rate_low", "rate_high", "distinct", "reachable_low", "reachable_high")
+    rows: dict[str, list] = {name: [] for name in names}
     for d in range(peak.shape[1]):
         of = {name: [] for name in rows}
         for m in range(modes):
@@ -108,8 +160,7 @@ def calibration(modes: int, healthy: Found, fresh, rate: float) -> Calibration:
             k, n = np.sum(~(other <= h)), len(other)
             values = (h, low, high, *rate_of(k, n), len(np.unique(maxima)), rate_of(np.sum(~(maxima <= h)), len(maxima))[0],
                       rate_of(np.sum(~(maxima < h)), len(maxima))[0])  # fmt: skip
-            names = ("threshold", "low", "high", "rate", "rate_low", "rate_high", "distinct", "reachable_low", "reachable_high")  # fmt: skip
-            for name, value in zip(names, values):
+            for name, value in zip(names, values, strict=True):
                 of[name].append(value)
         for name in of:
             rows[name].append(of[name])

@@ -4,20 +4,21 @@ The tallies of a detector: its largest score in the window, its first alarm afte
 its blame at the alarm and ten seconds later, the pointing error until the alarm, episodes of alarms. Several detectors
 run in one sweep and cost one simulation. The score of a packet counts at its stamp, t = 0 at the window's start.
 
-May import: leo4, metrics, telemetry, worlds, contract, scores, sweeping.
+May import: leo4, metrics, telemetry, worlds, compiling, contract, scores, soft_scores, sweeping.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from functools import lru_cache
+from collections.abc import Callable, Sequence
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxatt import scores
+from jaxatt import scores, soft_scores
+from jaxatt.compiling import jitted
 from jaxatt.contract import System, no_check
 from jaxatt.sweeping import sweep
 from jaxatt.yardstick import leo4, worlds
@@ -167,6 +168,63 @@ def run(
     with np.errstate(all="ignore"):
         found = sweep(system, params, days, key, ticks=PACKETS, score=score, progress=progress)
     return found
+
+
+class Softly(NamedTuple):
+    """What numbers of the detectors are differentiated through; one value a detector in front."""
+
+    peak: Any  # largest score in the window
+    delay: Any  # [s] expected min(delay, 60 s) of an alarm whose probability a packet is soft
+
+
+def _softly(width, params: Params, scenario, now, told: Told) -> Softly:
+    since = onset(scenario) - WARMUP
+    counted = (told.t > since) & (told.t <= since + HORIZON)
+    limit = jnp.where(scenario.mode > 0, params.threshold[:, 1], params.threshold[:, 0])
+    silent = jnp.where(counted, 1 - soft_scores.soft_alarm(told.score, limit, width), 1)
+    waited = jnp.where(counted, leo4.PACKET * silent, 0)
+    delay = soft_scores.Delay(waited, silent, jnp.zeros_like(waited))
+    return Softly(scores.peak(told.score, told.t > 0), delay)
+
+
+def slopes(
+    world: World, detectors: Sequence[Detector], key, days, numbers, params_of: Callable, *, threshold=None, width: float = 1.0
+) -> tuple[Softly, Softly]:  # fmt: skip
+    """What n days leave of detectors of numbers x, and its gradient, by forward mode.
+
+    Args:
+        world, detectors, key, days: as of `run`.
+        numbers: x, (k,).
+        params_of: x -> the params of all detectors, a tuple.
+        threshold: (detectors, modes); it gets a gradient too. None for infinite ones, which no score passes.
+        width: [unit of the score] over which the probability of an alarm rises at the threshold.
+
+    Returns:
+        `Softly` of shape (n, detectors), and its gradient (n, detectors, k + 2): by the numbers, and by the threshold
+        of the first and of the second mode.
+    """
+    detectors, x = tuple(detectors), np.asarray(numbers, np.float32)
+    shape = len(detectors), len(world.modes)
+    h = np.full(shape, np.inf, np.float32) if threshold is None else np.asarray(threshold, np.float32)
+    system = watched(world.system, tuple((d.init, d.step) for d in detectors))
+    axes = np.eye(len(x) + shape[1], dtype=np.float32)
+    directions = axes[:, : len(x)], axes[:, len(x) :]
+    world_params, width = jax.tree.map(_short, (world.params, width))
+    return jax.tree.map(np.asarray, _sloped(system, params_of)(directions, x, h, days, key, world_params, width))
+
+
+@lru_cache(maxsize=8)
+def _sloped(system: System, params_of: Callable):
+    """Of a system with detectors: value and gradient of `Softly`, compiled once."""
+
+    def found(x, move, h, days, key, world_params, width):
+        params = Params(world_params, params_of(x), h + move, jnp.full(h.shape[1], jnp.inf, h.dtype))
+        return sweep(system, params, days, key, ticks=PACKETS, score=partial(_softly, width), progress=False)
+
+    def along(direction, x, h, *rest):
+        return jax.jvp(lambda x, move: found(x, move, h, *rest), (x, jnp.zeros_like(h[0])), direction)
+
+    return jitted(jax.vmap(along, in_axes=(0, *[None] * 6), out_axes=(None, -1)))
 
 
 def _short(a):
