@@ -4,7 +4,7 @@ The rate r belongs to windows of T = 600 s: P(no alarm in T) = exp(-r T). The th
 score of healthy windows, whatever the scores' correlation in time; formulas for single samples miss the rate by orders.
 It has a gradient: as the numbers of a detector change, the threshold moves with the largest scores that lie next to it.
 
-May import: harness, rules, telemetry, worlds, check, loss.
+May import: harness, rules, telemetry, worlds, check, loss, noise.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import numpy as np
 
 from jaxatt import check
 from jaxatt.loss import wilson
+from jaxatt.noise import one_key
 from jaxatt.yardstick import worlds
 from jaxatt.yardstick.harness import Found, run, slopes
 from jaxatt.yardstick.rules import validated
@@ -77,6 +78,18 @@ def rate_of(k, n) -> tuple[Any, Any, Any]:
         return tuple(-np.log1p(-np.asarray(share, float)) / HOURS for share in (np.divide(k, n), *wilson(k, n)))  # pyright: ignore[reportReturnType]
 
 
+def windows_of(hours) -> int:
+    """Windows of so many hours, as many of each of two modes; refuses hours outside [100, 1e6]."""
+    between = "below 100 no rate of .1/h is known to a third"
+    check.between("hours", check.number("hours", hours), 99.999, 1e6, between)
+    return 2 * int(np.ceil(hours / (2 * HOURS) - 1e-9))
+
+
+def typed(key):
+    """One key, typed; refuses what is none."""
+    return jax.random.wrap_key_data(jax.numpy.asarray(one_key(key)))
+
+
 def windows(world: World, detectors: Sequence[Detector], key, n: int, progress: bool = False) -> Found:
     """What n healthy days leave, modes in turn."""
     return run(world, detectors, key, worlds.days(world, key, np.arange(n), None), progress=progress)
@@ -103,7 +116,7 @@ def calibrate(
         `Calibration`; its ``slope`` and ``slope_error`` are None without ``gradient``.
 
     Raises:
-        ValueError: no detector, two of one name, hours < 100, a rate outside (0, 6), numbers of another shape than (k,).
+        ValueError: no detector, two of one name, hours outside [100, 1e6], a rate outside (0, 6), numbers of another shape than (k,).
         TypeError: a detector whose step does not return a `Verdict` of a score () and a blame (11,); a function that
             gives no params for each detector.
 
@@ -112,13 +125,12 @@ def calibrate(
         >>> slack = lambda x: (BASELINES["cusum"].params._replace(slack=x[0]),)
         >>> found = calibrate(WORLDS["leo4"], [BASELINES["cusum"]], jax.random.key(7), gradient=([0.25], slack))
     """
-    detectors = tuple(detectors) if isinstance(detectors, Sequence) else ()
-    if gradient is not None:
-        detectors = _with_numbers(detectors, gradient)
-    detectors = validated(detectors)
-    check.above("hours", check.number("hours", hours), 99.999, "below it no rate of .1/h is known to a third")
+    check.kind("world", world, World)
+    key, n, modes = typed(key), windows_of(hours), len(world.modes)
     check.between("rate", check.number("rate", rate), 0, 6, "one alarm a window")
-    n, modes = 2 * int(np.ceil(hours / (2 * HOURS) - 1e-9)), len(world.modes)
+    if gradient is not None:
+        detectors = _with_numbers(validated(detectors), gradient)
+    detectors = validated(detectors)
     healthy = windows(world, detectors, jax.random.fold_in(key, 1), n, progress)
     fresh = windows(world, detectors, jax.random.fold_in(key, 2), n, progress)
     found = calibration(modes, healthy, fresh.peak, rate)

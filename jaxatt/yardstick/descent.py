@@ -16,7 +16,7 @@ import numpy as np
 
 from jaxatt import check
 from jaxatt.yardstick import metrics, worlds
-from jaxatt.yardstick.calibration import threshold_of, threshold_slope
+from jaxatt.yardstick.calibration import threshold_of, threshold_slope, typed, windows_of
 from jaxatt.yardstick.harness import slopes
 from jaxatt.yardstick.telemetry import Detector
 from jaxatt.yardstick.worlds import SIZED, World
@@ -54,9 +54,7 @@ def at_fixed_rate(
         >>> slack = lambda x: (cusum.params._replace(slack=x[0]),)
         >>> found = at_fixed_rate(WORLDS["leo4"], cusum, jax.random.key(0), [0.25], slack, hours=1000)
     """
-    check.above("hours", check.number("hours", hours), 99.999, "below it no rate of .1/h is known to a third")
-    days = check.whole("days", days, 1)
-    n, modes = 2 * int(np.ceil(3 * hours - 1e-9)), len(world.modes)
+    days, key, n, modes = check.whole("days", days, 1), typed(key), windows_of(hours), len(world.modes)
     calm, test = (jax.random.fold_in(key, i) for i in (1, 3))
     told, moved = slopes(world, [detector], calm, worlds.days(world, calm, np.arange(n), None), numbers, params_of)
     h, slope, error, spread = [], [], [], []

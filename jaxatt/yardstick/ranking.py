@@ -18,7 +18,7 @@ from jaxatt import check
 from jaxatt.loss import wilson
 from jaxatt.yardstick import baselines, metrics, rules, worlds
 from jaxatt.yardstick.board import VERSION, Board, plain
-from jaxatt.yardstick.calibration import DISTINCT, Calibration, calibration, windows
+from jaxatt.yardstick.calibration import DISTINCT, Calibration, calibration, typed, windows, windows_of
 from jaxatt.yardstick.harness import Found, run
 from jaxatt.yardstick.metrics import HORIZON
 from jaxatt.yardstick.rules import validated
@@ -27,6 +27,7 @@ from jaxatt.yardstick.worlds import CATALOGUE, HELD_OUT, MISMATCH, PAIRS, SIZED,
 
 RULESETS = ("nominal", "open")
 RATE = 0.1  # [1/h]
+MOST = 100_000  # days of a cell
 EARLY = 0.03  # share of days with an alarm before the onset above which a row is marked
 TIMED = 1e-4  # probability below which a score is marked as dependent on time
 
@@ -62,13 +63,16 @@ def rank(
     started = time.perf_counter()
     ranked = validated(detectors)
     check.kind("world", world, World)
-    if ruleset not in RULESETS:
+    if not isinstance(ruleset, str) or ruleset not in RULESETS:
         check.refuse("ruleset", f"be one of {', '.join(RULESETS)}", check.short(ruleset))
+    n = windows_of(hours)
     days = check.whole("days", days, 4)
-    check.above("hours", check.number("hours", hours), 99.999, "below it no rate of .1/h is known to a third")
-    catalogue = [(k, s) for k, sizes in CATALOGUE[world.name].items() for s in sizes] if cells is None else list(cells)
-    for cell in catalogue:
-        worlds.effects(cell)
+    if days > MOST:
+        check.refuse("days", f"be at most {MOST}", days)
+    key = None if key is None else typed(key)
+    catalogue = (
+        [(k, s) for k, sizes in CATALOGUE[world.name].items() for s in sizes] if cells is None else _cells(cells)
+    )
     references = tuple(d for d in baselines.REFERENCE if d.name not in {r.name for r in ranked})
     rows, names = (*ranked, *references), [d.name for d in ranked] + [d.name for d in references]
     tell = (
@@ -86,7 +90,6 @@ def rank(
     seed = rules.seed_of(world, ranked, VERSION) if key is None else None
     key = rules.key_of(seed) if seed is not None else key
 
-    n = 2 * int(np.ceil(3 * hours - 1e-9))
     tell(f"calibrate and validate on {n} windows each")
     healthy = windows(world, rows, jax.random.fold_in(key, 1), n)
     fresh = windows(world, rows, jax.random.fold_in(key, 2), n)
@@ -124,6 +127,23 @@ def rank(
     }  # fmt: skip
     matrix = {"names": names[: len(ranked)], "difference": difference, "error": error}
     return Board(*(plain(part) for part in (header, order, cell_table(names, catalogue, results), matrix)))
+
+
+def _cells(cells) -> list:
+    """The cells, if they are some, and none is there twice."""
+    given = list(cells) if isinstance(cells, (list, tuple)) else []
+    if not given:
+        check.refuse("cells", "be None or hold at least one cell (kind, size)", check.short(cells))
+    found = []
+    for i, cell in enumerate(given):
+        if cell is None:
+            check.refuse(f"cells[{i}]", "be (kind, size)", None)
+        worlds.effects(cell)
+        kind, size = cell
+        found.append((kind, tuple(map(float, size)) if isinstance(size, (tuple, list)) else float(size)))
+    if len(set(found)) < len(found):
+        check.refuse("cells", "differ", check.short(max(found, key=found.count)))
+    return found
 
 
 def _by_rank(row):

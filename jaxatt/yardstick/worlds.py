@@ -103,10 +103,11 @@ def effects(cell) -> tuple[Effect, Effect]:
         check.refuse("cell", wanted, check.short(cell))
     kinds = cell[0].split("+")
     sizes = cell[1] if len(kinds) > 1 else (cell[1],)
-    if not 1 <= len(kinds) <= 2 or not set(kinds) <= set(_EFFECTS) or len(tuple(sizes)) != len(kinds):
+    given = len(sizes) if isinstance(sizes, (tuple, list)) else 0
+    if not 1 <= len(kinds) <= 2 or not set(kinds) <= set(_EFFECTS) or given != len(kinds):
         check.refuse("cell", wanted, check.short(cell))
     for size in sizes:
-        check.positive("cell", size)
+        check.positive("cell", check.number("cell", size))
     found = [_EFFECTS[kind](size) for kind, size in zip(kinds, sizes)]
     return found[0], found[1] if len(found) > 1 else NO_EFFECT
 
