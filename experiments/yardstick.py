@@ -15,7 +15,8 @@ import optax
 
 from jaxatt import simulate, soft_scores
 from jaxatt.yardstick import NAMES, bank, baselines, leo4, metrics, oracle, rank, telemetry, tune, worlds
-from jaxatt.yardstick.calibration import threshold_of, threshold_slope
+from jaxatt.yardstick.board import differences
+from jaxatt.yardstick.calibration import rate_of, threshold_of, threshold_slope
 from jaxatt.yardstick.descent import at_fixed_rate
 from jaxatt.yardstick.fitting import healthy
 from jaxatt.yardstick.harness import run as run_days
@@ -81,9 +82,12 @@ def run(report) -> None:
     model(report)
     bounds(report)
     white_noise(report)
+    board(report)
     if not report.quick:
         tuned_cusum(report)
-    board(report)
+        cross_check(report)
+        coverage(report)
+        rebuilt(report)
 
 
 def world(report) -> None:
@@ -360,3 +364,80 @@ def whole(report, found, classical, shift) -> None:
         got = [max(alarms[name][f"{other}, {mode}"] for mode in ("hold", "slew")) for name in rates]
         report.relative(f"alarms an hour, {other[5:]}: {', '.join(rates)}", list(rates.values()), got, 0.2, REFERENCE)
     report.within("the clock gains nothing [s]", found.row("chi2_10")["macro"], None, found.row("clock")["macro"], "specification")  # fmt: skip
+
+
+# what takes long and needs no board
+
+COMMON = {
+    "mrp": 9.789e-5, "chi2_1": 25.23, "chi2_10": 72.02, "chi2_60": 260.1, "parity": 4.281, "parity 30 s": 4.182, "cusum": 24.80,
+    "glr": 5.207,
+}  # fmt: skip
+EARLIER = {
+    "mrp": 35.6, "chi2_1": 40.8, "chi2_10": 37.2, "chi2_60": 36.9, "parity": 42.6, "parity 30 s": 43.6, "cusum": 29.4, "glr": 19.2,
+}  # fmt: skip
+CELLS_29 = [
+    (kind, size)
+    for kind, sizes in {
+        "gyro_bias": (3.0, 10.0, 30.0), "gyro_drift": (100.0, 300.0, 1000.0), "gyro_stuck": (1.0,), "gyro_dead": (1.0,),
+        "gyro_scale": (0.005, 0.02, 0.1), "gyro_noise": (2.0, 3.0, 5.0), "gyro_intermittent": (30.0, 100.0),
+        "star_bias": (10.0, 20.0, 40.0), "star_noise": (2.0, 3.0, 5.0), "star_frozen": (1.0,),
+        "wheel_loss": (0.3, 0.6, 1.0), "wheel_offset": (0.3, 1.0, 3.0),
+    }.items()
+    for size in sizes
+]  # fmt: skip
+WORLD = worlds.WORLDS["leo4"]
+
+
+def largest(detectors, key, n: int):
+    """Largest scores of n healthy windows, (n, detectors)."""
+    return run_days(WORLD, detectors, key, worlds.days(WORLD, key, np.arange(n), None)).peak
+
+
+def cross_check(report, n: int = 24_000, days: int = 256) -> None:
+    """One threshold for both modes, and the plain mean of RMD60 over 29 cells of an earlier board."""
+    detectors = [tune(name) for name in COMMON]
+    peaks = largest(detectors, jax.random.key(31), n)
+    pooled = [threshold_of(peaks[:, d], 0.1)[0] for d in range(len(detectors))]
+    wide = [0.03 if name == "cusum" else 0.01 for name in COMMON]
+    report.check("common thresholds", list(COMMON.values()), pooled, (np.array(wide) * list(COMMON.values())).tolist(), REFERENCE)  # fmt: skip
+    found, key = [], jax.random.key(32)
+    for cell in CELLS_29:
+        f = run_days(WORLD, detectors, key, worlds.days(WORLD, key, np.arange(days), cell), threshold=[[h, h] for h in pooled])  # fmt: skip
+        found.append(metrics.rmd(f.first, f.punctual)[0])
+    report.check(
+        "mean RMD60 over 29 cells [s]", list(EARLIER.values()), np.mean(found, axis=0).tolist(), 0.9, REFERENCE
+    )
+
+
+def coverage(report, keys: int = 20, n: int = 2000, others: int = 48_000) -> None:
+    """How often the interval of a validated rate holds the rate of that threshold; how paired errors shrink with days."""
+    detectors = [tune("chi2_10"), tune("glr")]
+    many, covered = largest(detectors, jax.random.key(33), others), np.zeros(2, int)
+    for i in range(keys):
+        one, two = (largest(detectors, jax.random.fold_in(jax.random.key(34), 2 * i + part), n) for part in (0, 1))
+        for d in range(2):
+            h = np.array([threshold_of(one[m::2, d], 0.1)[0] for m in range(2)])
+            alarms = lambda peak, h=h, d=d: int(np.sum(peak[:, d].reshape(-1, 2) > h))
+            _, low, high = rate_of(alarms(two), n)
+            covered[d] += low <= rate_of(alarms(many), others)[0] <= high
+    report.within(f"intervals of chi2_10 and glr that hold, of {keys}", 0.85 * keys, None, covered.tolist(), "binomial")
+    r = healthy().residuals.reshape(-1, 7).astype(float)
+    params = baselines.glr_params(r.T @ r / len(r), bank.laws(), baselines.LAGS[:-1])
+    pair, key, cells = (
+        (tune("glr"), tune("glr")._replace(name="shorter", params=params)),
+        jax.random.key(35),
+        list(CELLS)[:3],
+    )
+    h, errors = [[threshold_of(peak, 0.1)[0]] * 2 for peak in largest(pair, key, 4000).T], []
+    for days in (256, 1024):
+        f = [run_days(WORLD, pair, key, worlds.days(WORLD, key, np.arange(days), cell), threshold=h) for cell in cells]
+        first, punctual = (np.stack([getattr(found, name) for found in f]) for name in ("first", "punctual"))
+        errors.append(metrics.paired(first, punctual, np.full(len(cells), 1 / len(cells)))[1][0, 1])
+    report.relative("paired error of 256 days over that of 1 024", 2.0, errors[0] / errors[1], 0.3, "1 / sqrt(days)")
+
+
+def rebuilt(report) -> None:
+    """A small board is the same to the bit when it is run again."""
+    how: dict = {"days": 16, "hours": 100, "cells": list(CELLS)[:2]}
+    one, two = (rank([tune("chi2_10"), tune("glr")], **how) for _ in range(2))
+    report.check("numbers of a board that differ when it is rebuilt", 0, len(differences(one, two)), 0, "itself")

@@ -1,5 +1,7 @@
 """The yardstick: its world against a plain loop, its faults, detectors, metrics and rules, and one small ranking."""
 
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,8 +24,10 @@ from jaxatt.yardstick import (
     rank,
     ranking,
     rules,
+    tune,
     worlds,
 )
+from jaxatt.yardstick import __main__ as command
 from jaxatt.yardstick.board import differences
 from jaxatt.yardstick.harness import Found, Softly, run, slopes
 from jaxatt.yardstick.products import correlations, product
@@ -523,3 +527,19 @@ def test_a_ranking_of_made_up_days_says_what_they_hold(monkeypatch, tmp_path):
     with pytest.raises(ValueError, match="pass the checks of the yardstick, but it is not causal"):
         monkeypatch.setattr(rules, "checked", lambda d: rules.Checks(False, True, True, True, True, 10.0))
         rank([MINE], days=16, hours=400)
+
+
+def test_the_command_rebuilds_a_board_and_says_where_it_differs(monkeypatch, tmp_path, capsys):
+    for module in (ranking, calibration):
+        monkeypatch.setattr(module, "run", made_up)
+    monkeypatch.setattr(rules, "checked", lambda d: rules.Checks(True, True, True, True, True, 10.0))
+    monkeypatch.setattr(command, "configure", lambda: None)
+    board, path = rank([tune("chi2_10"), tune("mrp")], days=16, hours=100, cells=[("gyro_bias+wheel_offset", (1.0, 2.0)), ("star_bias", 5)]), tmp_path / "b.json"  # fmt: skip
+    board.to_json(path)
+    assert command.main([str(path)]) == 0 and "the same to the bit" in capsys.readouterr().out
+    path.write_text(re.sub(r'"macro": \d', '"macro": 9', path.read_text(), count=1))
+    assert command.main([str(path)]) == 1
+    assert re.search(r"rows\[0\]\.macro: 9\S* is now [3-6]\.", capsys.readouterr().out)
+    board._replace(header=board.header | {"detectors": ["mine"]}).to_json(path)
+    with pytest.raises(SystemExit):
+        command.main([str(path)])
