@@ -1,4 +1,4 @@
-"""What the yardstick costs: nanoseconds of one core a packet of each baseline, and a tick of the board's sweep."""
+"""What the yardstick costs: nanoseconds of one core a tick of 10 Hz, of the loop, of each baseline in it, and of all."""
 
 from __future__ import annotations
 
@@ -10,21 +10,29 @@ import numpy as np
 from jaxatt.yardstick import NAMES, leo4, rules, tune, worlds
 from jaxatt.yardstick.harness import run
 
+DAYS = 256
+
 
 def rows(quick: bool) -> list[dict]:
-    """Each detector alone on recorded telemetry, 256 days side by side; all classical rows in the loop."""
-    names = ("chi2_10", "cusum", "glr") if quick else NAMES[:10]
-    detectors = [tune(name) for name in names]
-    found = [
-        {"name": f"{d.name}, a packet of one day", "value": rules.checked(d).nanoseconds, "unit": "core-ns"}
-        for d in detectors
-    ]
-    days = worlds.days(worlds.WORLDS["leo4"], jax.random.key(0), np.arange(256), None)
-    spent = []
-    for _ in range(2 if quick else 4):  # the first compiles
-        started = time.process_time()
-        run(worlds.WORLDS["leo4"], detectors, jax.random.key(1), days)
-        spent.append(time.process_time() - started)
-    ticks = 256 * worlds.PACKETS * leo4.TICKS
-    name = f"{len(names)} rows in the loop, a tick of 10 Hz"
-    return [*found, {"name": name, "value": 1e9 * min(spent[1:]) / ticks, "unit": "core-ns"}]
+    """Sweeps of 256 days with other rows in the loop, in turn, medians; then the GLR alone on recorded telemetry."""
+    names = ("chi2_10", "cusum", "glr") if quick else NAMES
+    sets = {"loop without rows": ("null",)} | {name: ("null", name) for name in names if name != "null"}
+    sets[f"all {len(names)} rows"] = names
+    world, key = worlds.WORLDS["leo4"], jax.random.key(1)
+    days = worlds.days(world, key, np.arange(DAYS), None)
+    detectors = {label: [tune(name) for name in members] for label, members in sets.items()}
+    spent: dict[str, list] = {label: [] for label in sets}
+    for turn in range(3 if quick else 6):
+        for label, members in detectors.items():
+            started = time.process_time()
+            run(world, members, key, days)
+            if turn:  # the first compiles
+                spent[label].append(time.process_time() - started)
+    ticks = DAYS * worlds.PACKETS * leo4.TICKS
+    cost = {label: 1e9 * float(np.median(times)) / ticks for label, times in spent.items()}
+    alone = cost["loop without rows"]
+    whole = [{"name": label, "value": cost[label], "unit": "core-ns"} for label in ("loop without rows", f"all {len(names)} rows")]  # fmt: skip
+    each = [{"name": f"{name} in the loop, more", "value": cost[name] - alone, "unit": "core-ns"} for name in sets if name in names]  # fmt: skip
+    ratio = {"name": "all rows over the loop", "value": cost[f"all {len(names)} rows"] / alone, "unit": "x"}
+    packet = {"name": "glr alone, a packet of one day", "value": rules.checked(tune("glr")).nanoseconds, "unit": "core-ns"}  # fmt: skip
+    return [*whole, ratio, *each, packet]

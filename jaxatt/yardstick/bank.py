@@ -19,10 +19,9 @@ from jaxatt.yardstick.telemetry import (
     KD,
     MEMORY,
     Detector,
-    Residuals,
+    OnResiduals,
     Verdict,
-    residuals_init,
-    residuals_step,
+    with_residuals,
 )
 
 LENGTH = 128  # [packets] of a signature
@@ -137,7 +136,6 @@ class Bank(NamedTuple):
 class BankState(NamedTuple):
     """What the bank remembers."""
 
-    residuals: Residuals
     x: Any  # (11, 14)
     odds: Any  # (11,) of each hypothesis against the healthy one
 
@@ -165,7 +163,7 @@ def bank_params(covariance) -> Bank:
 
 
 def bank_init(params: Bank) -> BankState:
-    return BankState(residuals_init(), jnp.zeros((11, 14)), jnp.full(11, APPEAR))
+    return BankState(jnp.zeros((11, 14)), jnp.full(11, APPEAR))
 
 
 def believed(params: Bank, x, odds, r):
@@ -181,13 +179,12 @@ def believed(params: Bank, x, odds, r):
     return product(params.ahead, x) + product(params.gain, jnp.broadcast_to(r, (11, 7))), odds
 
 
-def bank_step(params: Bank, z: BankState, telemetry: leo4.Telemetry):
+def bank_step(params: Bank, z: BankState, r, telemetry: leo4.Telemetry):
     """ln of the sum of the odds; odds' = odds N(r_h; S_h) / N(r; Sigma), then hypotheses appear and go."""
-    residuals, r = residuals_step(z.residuals, telemetry)
     x, odds = believed(params, z.x, z.odds, r)
-    return BankState(residuals, x, odds), Verdict(jnp.log(jnp.sum(odds)), odds)
+    return BankState(x, odds), Verdict(jnp.log(jnp.sum(odds)), odds)
 
 
 def mmae(covariance) -> Detector:
     """The bank as a row of the board."""
-    return Detector("mmae", bank_init, bank_step, bank_params(covariance), 5)
+    return Detector("mmae", with_residuals(bank_init), OnResiduals(bank_step), bank_params(covariance), 5)

@@ -7,7 +7,7 @@ May import: leo4, telemetry, products, vec, attitude, batching, detection.
 
 from __future__ import annotations
 
-from functools import partial
+from functools import cache
 from typing import Any, NamedTuple
 
 import jax
@@ -23,11 +23,10 @@ from jaxatt.yardstick.leo4 import Telemetry
 from jaxatt.yardstick.products import correlations, product, pushed
 from jaxatt.yardstick.telemetry import (
     Detector,
-    Residuals,
+    OnResiduals,
     Verdict,
     blame,
-    residuals_init,
-    residuals_step,
+    with_residuals,
 )
 
 LAGS = (1, 2, 4, 8, 16, 32, 64, 128)  # [packets] of the GLR
@@ -96,9 +95,10 @@ def summed(line, new):
     return in_lanes(window_sum, line, new)
 
 
-def window_init(packets: int, params) -> Any:
-    """A window of so many packets."""
-    return jnp.zeros(packets)
+@cache
+def window_of(packets: int):
+    """The init of a window of so many packets."""
+    return lambda params: jnp.zeros(packets)
 
 
 def chi2_step(params, z, telemetry: Telemetry):
@@ -111,30 +111,11 @@ def chi2_step(params, z, telemetry: Telemetry):
 # residuals
 
 
-class Windowed(NamedTuple):
-    """Residuals and a window of what is made of them."""
-
-    residuals: Residuals
-    recent: Any
-
-
-def parity_init(packets: int, params) -> Windowed:
-    return Windowed(residuals_init(), jnp.zeros(packets))
-
-
-def parity_step(params, z: Windowed, telemetry: Telemetry):
+def parity_step(params, recent, r, telemetry: Telemetry):
     """|sum of the parity over the window| / (sd sqrt N); params: sd [rad/s]."""
-    residuals, r = residuals_step(z.residuals, telemetry)
-    recent, total = summed(z.recent, r[3])
+    recent, total = summed(recent, r[3])
     score = jnp.abs(total) / (params * np.sqrt(len(recent)).item())
-    return Windowed(residuals, recent), Verdict(score, blame(gyro=jnp.ones_like(score), star=0.0, wheel=0.0))
-
-
-class Sums(NamedTuple):
-    """Residuals and their two-sided sums."""
-
-    residuals: Residuals
-    sums: Cusum  # (7,)
+    return recent, Verdict(score, blame(gyro=jnp.ones_like(score), star=0.0, wheel=0.0))
 
 
 class CusumParams(NamedTuple):
@@ -144,18 +125,18 @@ class CusumParams(NamedTuple):
     slack: Any = 0.25  # [1] half the shift that matters
 
 
-def cusum_init(params: CusumParams) -> Sums:
-    return Sums(residuals_init(), Cusum(jnp.zeros(7), jnp.zeros(7)))
+def cusum_init(params: CusumParams) -> Cusum:
+    """No sums yet, (7,) each."""
+    return Cusum(jnp.zeros(7), jnp.zeros(7))
 
 
-def cusum_step(params: CusumParams, z: Sums, telemetry: Telemetry):
+def cusum_step(params: CusumParams, sums: Cusum, r, telemetry: Telemetry):
     """Page's sums of the seven standardised residuals; the blame is on the unit of the largest."""
-    residuals, r = residuals_step(z.residuals, telemetry)
-    sums, channels = cusum(z.sums, r / params.std, params.slack)
+    sums, channels = cusum(sums, r / params.std, params.slack)
     score = jnp.max(channels)
     parts = [jnp.max(channels[3:4]), jnp.max(channels[:3]), jnp.max(channels[4:])]
     guilty = [jnp.where(part >= score, 1.0, 0.0).astype(score.dtype) for part in parts]
-    return Sums(residuals, sums), Verdict(score, blame(*guilty))
+    return sums, Verdict(score, blame(*guilty))
 
 
 class GlrParams(NamedTuple):
@@ -170,9 +151,8 @@ class GlrParams(NamedTuple):
 
 
 class GlrState(NamedTuple):
-    """Residuals and their whitened past."""
+    """The whitened past of the residuals."""
 
-    residuals: Residuals
     axes: Any  # (128, 2, 3) oldest first
     parity: Any  # (128, 1, 1)
 
@@ -205,12 +185,11 @@ def glr_params(covariance, laws, lags: tuple = LAGS) -> GlrParams:
 
 def glr_init(params: GlrParams) -> GlrState:
     longest = max(map(len, params.axis))
-    return GlrState(residuals_init(), jnp.zeros((longest, 2, 3)), jnp.zeros((longest, 1, 1)))
+    return GlrState(jnp.zeros((longest, 2, 3)), jnp.zeros((longest, 1, 1)))
 
 
-def glr_step(params: GlrParams, z: GlrState, telemetry: Telemetry):
+def glr_step(params: GlrParams, z: GlrState, r, telemetry: Telemetry):
     """max over channels h and lags l of |f_hl . z| / |f_hl| over the last l packets; blame: softmax of its square / 2."""
-    residuals, r = residuals_step(z.residuals, telemetry)
     a, b, c, d = params.whiten
     axes = pushed(z.axes, jnp.stack([a * r[:3], b * r[:3] + c * r[4:]]))
     parity = pushed(z.parity, d * r[3:4, None])
@@ -221,7 +200,7 @@ def glr_step(params: GlrParams, z: GlrState, telemetry: Telemetry):
         found = jnp.concatenate([gyros, star * of_axes[1], product(wheel, of_axes[2])])
         best = jnp.maximum(best, jnp.abs(found))
     score = jnp.max(best)
-    return GlrState(residuals, axes, parity), Verdict(score, jax.nn.softmax(0.5 * best * best))
+    return GlrState(axes, parity), Verdict(score, jax.nn.softmax(0.5 * best * best))
 
 
 # ten packets' means, without dynamics
@@ -244,20 +223,20 @@ def features(residual, telemetry: Telemetry):
     return jnp.concatenate([residual[:3], gyro, residual[4:], jnp.stack(leo4.summed(torque))])
 
 
-def pca_init(params) -> Windowed:
-    return Windowed(residuals_init(), jnp.zeros((10, 13)))
+def pca_init(params):
+    """Ten packets' features."""
+    return jnp.zeros((10, 13))
 
 
-def pca_step(params: PcaParams, z: Windowed, telemetry: Telemetry):
+def pca_step(params: PcaParams, recent, r, telemetry: Telemetry):
     """max(T2 / T2lim, Q / Qlim) of the ten packets' mean; blame: each unit's share of the squared residual."""
-    residuals, r = residuals_step(z.residuals, telemetry)
-    recent, total = summed(z.recent, features(r, telemetry))
+    recent, total = summed(recent, features(r, telemetry))
     standard = (total / 10 - params.mean) / params.std
     main, rest = product(params.main, standard), product(params.rest, standard)
     share = rest * rest
     score = jnp.maximum(jnp.sum(main * main) / params.limits[0], jnp.sum(share) / params.limits[1])
     parts = [jnp.sum(share[3:7]), jnp.sum(share[:3]), jnp.sum(share[7:])]
-    return Windowed(residuals, recent), Verdict(score, blame(*parts))
+    return recent, Verdict(score, blame(*parts))
 
 
 # reference rows
@@ -333,13 +312,13 @@ S = leo4.STD_INNOVATION**2
 
 def chi2(packets: int) -> Detector:
     """The chi-square row of so many packets."""
-    return Detector(f"chi2_{packets}", partial(window_init, packets), chi2_step, np.float32(S), 1)
+    return Detector(f"chi2_{packets}", window_of(packets), chi2_step, np.float32(S), 1)
 
 
 def parity(packets: int, std) -> Detector:
     """The parity row of so many packets; std: of the parity residual [rad/s]."""
     name = "parity" if packets == 10 else f"parity {packets // 2} s"
-    return Detector(name, partial(parity_init, packets), parity_step, np.float32(std), 1)
+    return Detector(name, with_residuals(window_of(packets)), OnResiduals(parity_step), np.float32(std), 1)
 
 
 def nothing(params):

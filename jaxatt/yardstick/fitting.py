@@ -19,7 +19,7 @@ from jaxatt.contract import no_check
 from jaxatt.noise import BLOCK, one_key
 from jaxatt.sweeping import block_of, block_records
 from jaxatt.yardstick import bank, baselines, leo4, worlds
-from jaxatt.yardstick.telemetry import Detector, residuals_init, residuals_step
+from jaxatt.yardstick.telemetry import Detector, OnResiduals, residuals_init, residuals_step, with_residuals
 
 WINDOWS = 256
 SHARE = 0.95  # of the features' variance that the plane of pca holds
@@ -119,10 +119,16 @@ def tune(name: str, key=None) -> Detector:
         return baselines.parity(10 if name == "parity" else 60, std[3])
     if name == "cusum":
         params = baselines.CusumParams(std.astype(np.float32), np.float32(0.25))
-        return Detector("cusum", baselines.cusum_init, baselines.cusum_step, params, 1)
+        return Detector("cusum", with_residuals(baselines.cusum_init), OnResiduals(baselines.cusum_step), params, 1)
     if name == "glr":
         params = baselines.glr_params(covariance, bank.laws())
-        return Detector("glr", baselines.glr_init, baselines.glr_step, params, 8)
+        return Detector("glr", with_residuals(baselines.glr_init), OnResiduals(baselines.glr_step), params, 8)
     if name == "mmae":
         return bank.mmae(covariance)
-    return Detector("pca", baselines.pca_init, baselines.pca_step, pca_params(found.features, found.means), 3)
+    return Detector(
+        "pca",
+        with_residuals(baselines.pca_init),
+        OnResiduals(baselines.pca_step),
+        pca_params(found.features, found.means),
+        3,
+    )

@@ -23,7 +23,7 @@ from jaxatt.contract import System, no_check
 from jaxatt.sweeping import sweep
 from jaxatt.yardstick import leo4, worlds
 from jaxatt.yardstick.metrics import HORIZON
-from jaxatt.yardstick.telemetry import Detector
+from jaxatt.yardstick.telemetry import Detector, OnResiduals, residuals_step
 from jaxatt.yardstick.worlds import PACKETS, WARMUP, World
 
 LATER = 10.0  # [s] after an alarm at which the blame is read again
@@ -95,7 +95,7 @@ def watched(system: System, steps: tuple) -> System:
     def tick(params: Params, scenario, now, x, z, noise):
         world, states, watch = z
         x, world, log = system.tick(params.world, scenario, now, x, world, noise)
-        told = [step(p, s, log.telemetry) for (_, step), p, s in zip(steps, params.detectors, states)]
+        told = _told(steps, params.detectors, states, log.telemetry)
         score = jnp.stack([verdict.score for _, verdict in told])
         t = now.t + (leo4.PACKET - WARMUP)
         limit = jnp.where(log.telemetry.mode > 0, params.threshold[:, 1], params.threshold[:, 0])
@@ -109,6 +109,19 @@ def watched(system: System, steps: tuple) -> System:
         return system.flow(params.world, scenario, t, x, z[0])
 
     return system._replace(init=init, tick=tick, flow=flow, check=no_check)
+
+
+def _told(steps: tuple, params: tuple, states: tuple, telemetry: leo4.Telemetry) -> list:
+    """State and verdict of every detector; those on residuals share them, for all have seen the same packets."""
+    shared, told = None, []
+    for (_, step), p, z in zip(steps, params, states):
+        if isinstance(step, OnResiduals):
+            shared = residuals_step(z[0], telemetry) if shared is None else shared
+            after, verdict = step.step(p, z[1], shared[1], telemetry)
+            told.append(((shared[0], after), verdict))
+        else:
+            told.append(step(p, z, telemetry))
+    return told
 
 
 def score(params: Params, scenario, now, told: Told) -> Found:

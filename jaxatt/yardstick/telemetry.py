@@ -8,6 +8,7 @@ May import: leo4, steady, vec, sensors.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from typing import Any, NamedTuple
 
 import jax
@@ -96,3 +97,23 @@ def residuals_step(state: Residuals, telemetry: Telemetry) -> tuple[Residuals, A
     (w, a, dyn), _ = jax.lax.scan(one, (w, state.a, Vec3(*(0 * v for v in w))), (y, u))
     r = jnp.concatenate([telemetry.innovation, hp[None], array(dyn)])
     return Residuals(baseline, jnp.minimum(seen + 1, 1e6), w, a), r
+
+
+class OnResiduals(NamedTuple):
+    """A detector's step that sees the residuals of the packet too; several in one sweep share them.
+
+    Its state is (`Residuals`, z), as `with_residuals` starts it.
+    """
+
+    step: Callable[[Any, Any, Any, Telemetry], tuple[Any, Verdict]]  # (params, z, residuals (7,), telemetry)
+
+    def __call__(self, params, z, telemetry: Telemetry):
+        residuals, r = residuals_step(z[0], telemetry)
+        after, verdict = self.step(params, z[1], r, telemetry)
+        return (residuals, after), verdict
+
+
+@cache
+def with_residuals(init: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """The init of a detector whose step is `OnResiduals`: the same function for the same ``init``."""
+    return lambda params: (residuals_init(), init(params))
