@@ -217,8 +217,8 @@ def white_noise(report) -> None:
         step, state = optimizer.update(ewma_at_rate(memory, key, 1500, packets)["total"] * np.array([memory]), state)
         theta = theta + np.asarray(step)
     memory = np.exp(theta[0]).item()
-    # from .041 to .07 the delay differs by no more than its own error
-    report.check("memory where the descent from .4 ends", 0.056, memory, 0.015, REFERENCE)
+    # near the end the gradient has a standard error of 10 s and rises by 2000 s per unit of memory: .005 on either side
+    report.check("memory where the descent from .4 ends", 0.056, memory, 3 * np.hypot(0.005, 0.005), REFERENCE)
     fresh = [ewma_at_rate(m, jax.random.key(1), 1500, packets)["rmd"] for m in (0.4, memory)]
     report.check("RMD60 on fresh windows, before and after [s]", [49.6, 14.3], fresh, 1.0, REFERENCE)
 
