@@ -16,8 +16,8 @@ DAYS = 256
 def rows(quick: bool) -> list[dict]:
     """Sweeps of 256 days with other rows in the loop, in turn, medians; then the GLR alone on recorded telemetry."""
     names = ("chi2_10", "cusum", "glr") if quick else NAMES
-    sets = {"loop without rows": ("null",)} | {name: ("null", name) for name in names if name != "null"}
-    sets[f"all {len(names)} rows"] = names
+    sets: dict[str, tuple[str, ...]] = {"loop without rows": ("null",), f"all {len(names)} rows": tuple(names)}
+    sets.update({name: ("null", name) for name in names if name != "null"})
     world, key = worlds.WORLDS["leo4"], jax.random.key(1)
     days = worlds.days(world, key, np.arange(DAYS), None)
     detectors = {label: [tune(name) for name in members] for label, members in sets.items()}
