@@ -89,6 +89,23 @@ def _dotted(path) -> str:
     return f".{text}" if text else ""
 
 
+def named(tree, alone: str) -> dict:
+    """The leaves of a tree by name: ``delay``, ``main.delay``, ``spans.0``; alone: the name of a single leaf."""
+    leaves = jax.tree_util.tree_leaves_with_path(tree)
+    return {jax.tree_util.keystr(path, simple=True, separator=".") or alone: leaf for path, leaf in leaves}
+
+
+def units_within(tree) -> dict[str, str]:
+    """The units that the NamedTuples of any tree state, by the names of `named`."""
+    parts = jax.tree_util.tree_leaves_with_path(tree, is_leaf=lambda node: hasattr(node, "_fields"))
+    found = {}
+    for path, part in parts:
+        at = jax.tree_util.keystr(path, simple=True, separator=".")
+        if hasattr(part, "_fields"):
+            found |= {f"{at}.{name}" if at else name: unit for name, unit in units(part).items()}
+    return found
+
+
 def instants(tree, put: Callable):
     """The tree with put(a) in place of every leaf a of the fields that are instants."""
     if not hasattr(tree, "_fields"):

@@ -22,6 +22,7 @@ from jaxatt import check
 
 SEPARATORS = (",", ";", "\t", "|", " ")  # a space stands for any run of spaces and tabs
 STAMPS = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9, "iso": None}  # units of time, parts of a second
+FLAGS = {"true": 1.0, "false": 0.0}
 MISSING = frozenset(("", "nan", "na", "n/a", "#n/a", "#na", "<na>", "null", "none", "-", "--", "---"))
 CHUNK = 10_000  # rows that are held as text at a time
 
@@ -188,6 +189,8 @@ def _number(cell: str, decimal: str) -> float:
         pass
     if cell.lower() in MISSING:
         return np.nan
+    if cell.lower() in FLAGS:
+        return FLAGS[cell.lower()]
     raise ValueError
 
 
@@ -222,7 +225,7 @@ def _seconds_of_date(cell: str) -> float:
 # headers
 
 
-def _name_and_unit(header: str) -> tuple[str, str | None]:
+def name_and_unit(header: str) -> tuple[str, str | None]:
     """Name and unit of "gyro [rad/s]" or "gyro (rad/s)"; None where it says none, as in "q[0]" and "w_[x]"."""
     split = re.fullmatch(r"(.*?)(\s*)(?:\[([^][]*)\]|\(([^()]*)\))", header)
     if not split:
@@ -235,7 +238,7 @@ def _name_and_unit(header: str) -> tuple[str, str | None]:
 
 def column(file: str, header: list[str], separator: str, name: str, unit: str | None) -> int:
     """Index of the column of a name and unit, or of a whole header."""
-    known = [_name_and_unit(column) for column in header]
+    known = [name_and_unit(column) for column in header]
     found = [i for i, (other, said) in enumerate(known) if other == name and said is not None and said == unit]
     if len(found) > 1:
         check.refuse(name, f"be one column of {file} (ask for one by its whole header)", [header[i] for i in found])
@@ -260,7 +263,7 @@ def column(file: str, header: list[str], separator: str, name: str, unit: str | 
 
 def time_column(file: str, header: list[str], separator: str, time: str, stamps: str | None) -> int:
     """Index of the column of times. Where the unit of the stamps is asked for, the header need not say it."""
-    known = [_name_and_unit(other) for other in header]
+    known = [name_and_unit(other) for other in header]
     if stamps is None:
         others = sorted({said for name, said in known if name == time and said in STAMPS})
         if others and "s" not in others:

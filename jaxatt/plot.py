@@ -157,7 +157,7 @@ def fault_times(scenario) -> dict[str, float]:
 @_figure
 def overview(
     t,
-    panels: Mapping[str, Any],
+    panels: Mapping[str, Any] | Sequence[str] | None = None,
     *,
     faults: Mapping[str, float] | None = None,
     thresholds: Mapping[str, float] | None = None,
@@ -169,9 +169,14 @@ def overview(
     t: (T,) [s]. panels: by axis label with unit, values of shape (T,) or (T, k), a `Vec3` of (T,) or several (T,) by
     name. faults: onsets [s] by name, as `fault_times` gives them. thresholds: by the label of their panel. alarm: (T,) bool.
     Returns the axes, one for each panel.
+
+    Or t is a table of one run, a dataset or data frame of `jaxatt.tables`: every quantity that it holds is a panel, or those
+    that panels names, ``["w", "filter.nis"]``; the labels are names with their units, "w [rad/s]".
     """
+    if hasattr(t, "data_vars") or (hasattr(t, "columns") and hasattr(t, "index")):
+        t, panels = _run_of(t, panels)
     t, faults, thresholds = _series("t", t), _mapping("faults", faults), _mapping("thresholds", thresholds)
-    check.mapping("panels", panels)
+    panels = _mapping("panels", panels)
     if not panels:
         check.refuse("panels", "hold at least one quantity", "empty")
     for name, values in (("t", t), ("faults", [*faults.values()]), ("thresholds", [*thresholds.values()])):
@@ -210,6 +215,38 @@ def overview(
         )  # fmt: skip
     axes[-1].set_xlabel("time [s]")
     return axes
+
+
+def _run_of(data, names) -> tuple[Any, dict[str, dict]]:
+    """Times and panels of a table of one run: the components of one quantity, ``w.x`` or ``h.0``, share a panel."""
+    if hasattr(data, "data_vars"):
+        units = {str(name): a.attrs.get("units") for name, a in data.data_vars.items()}
+        axes, t = tuple(data.dims), data.get("time")
+    else:
+        stated, axes, t = data.attrs.get("units") or {}, tuple(data.index.names), data.index
+        units = {str(name): stated.get(name) for name in data.columns}
+    if axes != ("time",):
+        check.refuse("t", "be a table of one run over time (of a batch take data.isel(scenario=0))", f"over {axes}")
+    found: dict[str, dict] = {}
+    for name, unit in units.items():
+        stem, _, part = name.rpartition(".")
+        stem, part = (stem, part) if stem and (part in "xyzw" or part.isdigit()) else (name, "")
+        found.setdefault(stem, {}).setdefault(unit, {})[part] = np.asarray(data[name])
+    if names is not None:
+        names = list(names) if np.iterable(names) and not isinstance(names, (str, Mapping)) else [names]
+        for name in names:
+            if name not in list(found):
+                check.refuse("panels", f"name quantities of the table ({', '.join(found)})", check.short(name))
+        found = {str(name): found[str(name)] for name in names}
+    panels = {}
+    for stem, parts in found.items():
+        for unit, lines in parts.items():
+            if not unit:
+                check.refuse(
+                    stem, "have a unit (see `units` of `jaxatt.tables.dataset`, or name other panels)", "without"
+                )
+            panels[f"{stem} [{unit}]"] = lines
+    return np.asarray(t), panels
 
 
 # many runs

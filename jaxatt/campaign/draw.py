@@ -14,11 +14,12 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from jaxatt import check, fields
+from jaxatt import check
 from jaxatt.campaign.store import OWN, Variable
 from jaxatt.compiling import compiled
 from jaxatt.contract import System
 from jaxatt.engine import prepared, tree_bytes, validated
+from jaxatt.fields import named, units_within
 from jaxatt.noise import BLOCK, one_key
 from jaxatt.sweeping import block_of, block_records, score_shapes, scored
 
@@ -160,12 +161,6 @@ def refused(system: System, params, scenarios, ticks: int) -> np.ndarray:
     return bad
 
 
-def named(tree, alone: str) -> dict:
-    """The leaves of a tree by name: ``delay``, ``main.delay``, ``spans.0``; alone: the name of a single leaf."""
-    leaves = jax.tree_util.tree_leaves_with_path(tree)
-    return {jax.tree_util.keystr(path, simple=True, separator=".") or alone: leaf for path, leaf in leaves}
-
-
 def variables(campaign: Campaign) -> dict[str, Variable]:
     """The arrays of the store by name; draws the first scenarios and traces the loop.
 
@@ -191,7 +186,7 @@ def variables(campaign: Campaign) -> dict[str, Variable]:
         trees["record"] = records
     arrays = {}
     for role, tree in trees.items():
-        units = {**_units(tree), **campaign.units}
+        units = {**units_within(tree), **campaign.units}
         for name, a in named(tree, role).items():
             if name in (*arrays, OWN, "time", "scenario"):
                 check.refuse(f"{role}.{name}", "have a name of its own among scores, inputs and records", repr(name))
@@ -202,14 +197,3 @@ def variables(campaign: Campaign) -> dict[str, Variable]:
         if name not in arrays:
             check.refuse("campaign.units", f"name scores, inputs or records ({', '.join(arrays)})", repr(name))
     return arrays
-
-
-def _units(tree) -> dict[str, str]:
-    """The units that the NamedTuples of a tree state, by the names of `named`."""
-    parts = jax.tree_util.tree_leaves_with_path(tree, is_leaf=lambda node: hasattr(node, "_fields"))
-    found = {}
-    for path, part in parts:
-        at = jax.tree_util.keystr(path, simple=True, separator=".")
-        if hasattr(part, "_fields"):
-            found |= {f"{at}.{name}" if at else name: unit for name, unit in fields.units(part).items()}
-    return found

@@ -4,7 +4,7 @@ A campaign goes on only where all of it is the same; the message says what diffe
 compared by their names, those of a user by what they are: their code, what they capture, and the functions and numbers
 that they use. So a script may be renamed, or run and then imported.
 
-May import: check, noise, store, draw.
+May import: check, fields, noise, store, draw.
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ import xarray as xr
 import zarr
 
 from jaxatt import check, noise
-from jaxatt.campaign.draw import Campaign, named
+from jaxatt.campaign.draw import Campaign
+from jaxatt.fields import named
 
 
 def manifest_of(campaign: Campaign, n: int) -> dict:

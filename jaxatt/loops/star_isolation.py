@@ -156,7 +156,7 @@ class Z(NamedTuple):
 class Verdict(NamedTuple):
     """What the computer concludes at a tick."""
 
-    innovation: Innovation  # each (2,): of both filters; no star is used at tick 0
+    innovation: Annotated[Innovation, "1"]  # each (2,): of both filters; no star is used at tick 0
     J: Annotated[Any, "1"]  # (2,) evaluation, eq. (18); that of the last star where there is none
     alarm: Annotated[Any, "1"]  # (2,) bool; never without a star
     latched: Annotated[Any, "1"]  # (2,) bool: an alarm now or before
