@@ -8,15 +8,15 @@ loop gives the functions and what the computer knows at the start::
 
 Of the computer the scenario decides the start alone: initial estimates and the like. Where an observer or an adaptive law
 moves between ticks (`observer_pd`, `wheel_mrac`), ``flow=loop.computer_flow`` and the system's ``substeps`` go along.
-`load` reads a CSV or Parquet file, which never executes code, `unit_quaternions` mends quaternions of few digits, and
-`resample` brings samples to the ticks.
+`load` reads a file of text or Parquet, which never executes code, `report` says what it understood, `merged` joins the clocks
+of several instruments, `unit_quaternions` mends quaternions of few digits, and `resample` brings samples to the ticks.
 
-May import: check, clock, faults, contract, compiling, engine, logfiles.
+May import: check, clock, faults, contract, compiling, engine, loading, logfiles.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,8 @@ from jaxatt.compiling import compiled
 from jaxatt.contract import Now
 from jaxatt.engine import alone, match_state, rk4
 from jaxatt.faults import Reading
-from jaxatt.logfiles import SEPARATORS, STAMPS, column, read, time_column
+from jaxatt.loading import DIRECTIONS, Quaternion, Understood, agree, report_of, understood
+from jaxatt.logfiles import Layout
 
 EXAMPLE = Path(__file__).parent / "data" / "telemetry.csv"  # made by notebooks/telemetry.py, with a hidden fault
 SPARSE = 1000  # ticks per sample beyond which the times are taken to be wrong
@@ -149,68 +150,176 @@ def load(
     path,
     units: Mapping[str, str | None],
     *,
-    time: str = "time",
+    time: Any = "time",
     stamps: str | None = None,
+    zone: str | None = None,
     separator: str = ",",
     decimal: str = ".",
+    header: Sequence[str] | None = None,
+    skip: int = 0,
+    encoding: str = "utf-8",
+    told: Mapping[str, str] | None = None,
+    where: Mapping[str, Any] | None = None,
+    missing: Collection | None = None,
+    quaternions: Mapping[str, Quaternion] | None = None,
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Times and channels of a ``.csv`` or ``.parquet`` file whose columns are named "gyro_a [rad/s]".
+    """Times and channels of a file of text (``.csv``, ``.txt``, ``.log``, ...) or ``.parquet``.
 
     A channel is asked for by name and unit: of "gyro [deg/s]" and "gyro [rad/s]", ``{"gyro": "rad/s"}`` is the second;
-    "gyro (rad/s)" is the same name. Or by its whole header, whatever it looks like: ``{"q[0]": "1", "gx (deg/s)":
-    "deg/s"}``; a unit in it must be the one asked for. Columns that nobody asks for are left alone.
+    "gyro (rad/s)" is the same name. A unit of the same quantity is converted, `report` says by what factor. Or by its whole
+    header, whatever it looks like: ``{"q[0]": "1", "gx (deg/s)": "deg/s"}``. Elements of arrays, "[0.1 0.2 0.3]" in one cell
+    or lists of Parquet, are ``{"w.0": "rad/s"}``. Columns that nobody asks for are left alone.
 
-    An empty cell and words such as NaN are missing samples, NaN. Rows of one time, such as those of several instruments,
-    become one where no channel is given twice. Blank lines and lines that begin with # are passed over. Needs the extra
-    ``data``.
+    An empty cell and words such as NaN are missing samples, NaN; true and false are 1 and 0. Rows of one time, such as those
+    of several instruments, become one where no channel is given twice; `merged` joins clocks. Blank lines and lines that
+    begin with #, % or // are passed over; a row of units below the header belongs to it; where the first row is of numbers
+    the comment before it is the header. What the file says itself is held against what is told here; nothing is guessed. Keep
+    the arguments of a logger in a dict and pass ``**layout``. Needs the extra ``data``.
 
     Args:
         path: of the file.
-        units: the unit of each channel that is asked for; None for a whole header that says none.
-        time: name or whole header of the column of times.
-        stamps: unit of the times: "s", "ms", "us", "ns", or "iso" for dates of ISO 8601, UTC where they say no offset;
-            None: the header says [s].
-        separator: what stands between the cells of a CSV file: ",", ";", "|", a tab, or " " for any run of spaces.
-        decimal: "." or ",", the decimal sign of a CSV file.
+        units: the unit of each channel that is asked for; None for a whole header, as it is.
+        time: name or whole header of the column of times, or the two of date and time of day, of seconds and nanoseconds.
+        stamps: unit of the times: "s", "ms", "us", "ns", "s+ns" in two columns, or "iso" for dates of ISO 8601; None: the
+            header says [s].
+        zone: of dates that name none, "+01:00" or "Europe/Berlin"; None: UTC.
+        separator: what stands between the cells of a text: ",", ";", "|", a tab, or " " for any run of spaces.
+        decimal: "." or ",", the decimal sign of a text.
+        header: names of all columns of a file that has no header.
+        skip: lines before the header.
+        encoding: of a text, such as "latin-1" or "utf-16".
+        told: units of columns whose headers say none, by whole header.
+        where: what a row must hold to be read, by header: ``{"sensor": 1}`` of a file of several instruments.
+        missing: numbers or words that mark missing samples; None: likely ones, such as -9999, are refused.
+        quaternions: by name, how four columns, or one of arrays, hold an attitude: see `Quaternion`. "att" becomes the unit
+            quaternion att.w, att.x, att.y, att.z, body to reference, without jumps of sign (`unit_quaternions`).
 
     Returns:
-        Times (T,) [s], of dates since 1970, and channels (T,) by the keys of ``units``.
+        Times (T,) [s], of dates since 1970, and channels (T,) by the keys of ``units``, then those of ``quaternions``.
 
     Raises:
-        ValueError: in one line: a channel that is missing, not in the unit asked for or not the only one, a header twice,
-            a row with more or fewer cells than the header (one empty cell at its end may be too many), a cell that is no
-            number or not finite, decimal commas, separators and stamps other than those asked for, times that do not
-            increase, a file that cannot be read as what its name says.
+        ValueError: in one line: a channel that is missing, of another quantity than asked for or not the only one, a header
+            twice, a row with more or fewer cells than the header (one empty cell at its end may be too many), a cell that is
+            no number or not finite, decimal commas, separators and stamps other than those asked for, times that do not
+            increase, rows of several instruments, what is told against what the file says, a file that cannot be read as what
+            its name says.
         TypeError: what is no path or no mapping.
         ImportError: without pandas or pyarrow.
 
     Example:
         >>> t, columns = load("log.csv", {"gyro": "deg/s", "q[0]": "1"}, separator=";", decimal=",", stamps="ms")
     """
-    path = check.place("path", path)
-    check.mapping("units", units)
-    for name, value, allowed in (
-        ("stamps", stamps, (None, *STAMPS)),
-        ("separator", separator, SEPARATORS),
-        ("decimal", decimal, (".", ",")),
-    ):
-        if not (value is None or isinstance(value, str)) or value not in allowed:
-            check.refuse(name, f"be one of {allowed}", check.short(value))
-    if separator == decimal:
-        check.refuse("separator", "differ from `decimal`", repr(separator))
+    layout = Layout(separator, decimal, stamps, zone, header, skip, encoding, where, missing)
+    return _finished(understood(path, units, time, layout, told, quaternions))
 
-    def pick(header: list[str]) -> list[int]:
-        at = time_column(path.name, header, separator, str(time), stamps)
-        return [at, *(column(path.name, header, separator, str(name), unit) for name, unit in units.items())]
 
-    t, *values = read(path, pick, separator, decimal, stamps or "s")
-    return checked(t, dict(zip(units, values)))
+def report(path, units: Mapping[str, str | None], *, time: Any = "time", told=None, quaternions=None, **layout) -> str:
+    """What `load` understands of a file, in words, before anything runs: read it once for every logger.
+
+    Args:
+        path: of the file.
+        units: as of `load`.
+        time: as of `load`.
+        told: as of `load`.
+        quaternions: as of `load`.
+        layout: the other arguments of `load`.
+
+    Returns:
+        Lines: the file and how it is written; the time base; each channel with its column, unit, factor and range; rate and gaps
+        of the channels that are sampled together, an instrument; the columns that are left alone.
+
+    Raises:
+        ValueError: what `load` raises.
+        TypeError: what `load` raises, and arguments that it has not.
+
+    Example:
+        >>> print(report("log.csv", {"gyro": "rad/s"}, separator=";", stamps="ms"))
+    """
+    if other := set(layout) - set(Layout._fields):
+        raise TypeError(f"`layout` must be arguments of load, but it is {', '.join(sorted(other))}.")
+    found = understood(path, units, time, Layout(**layout), told, quaternions)
+    return report_of(found, *_finished(found))
+
+
+def _finished(found: Understood) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Times and channels as they are handed on: checked, rows of one time joined, attitudes as quaternions of ours."""
+    t, columns = checked(found.t, found.columns)
+    for name, q in found.quaternions.items():
+        four = found.parts[name]
+        unit = list(unit_quaternions(columns, four).values())
+        if q.direction != DIRECTIONS[0]:
+            unit[1:] = [-part for part in unit[1:]]
+        columns = {other: a for other, a in columns.items() if other not in four}
+        if twice := [f"{name}.{part}" for part in "wxyz" if f"{name}.{part}" in columns]:
+            check.refuse("quaternions", "have names that no channel has", repr(twice[0]))
+        columns |= {f"{name}.{part}": a for part, a in zip("wxyz", unit)}
+    return t, columns
+
+
+def merged(
+    recordings: Mapping[str, tuple], offsets: Mapping[str, float] | None = None
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Recordings of instruments with clocks of their own as one: all times in order, NaN where a channel has no sample.
+
+    Args:
+        recordings: by instrument, times [s] and channels, as `load` returns them.
+        offsets: [s] to be added to the times of an instrument, 0 where none is told.
+
+    Returns:
+        Times and channels, for `resample`.
+
+    Raises:
+        ValueError: two channels of one name, an offset of no instrument, clocks that have no time in common.
+        TypeError: what is no mapping.
+
+    Example:
+        >>> t, columns = merged({"imu": load("imu.csv", gyro), "star": load("star.csv", q)}, offsets={"star": -0.25})
+    """
+    check.mapping("recordings", recordings)
+    offsets = {} if offsets is None else offsets
+    check.mapping("offsets", offsets)
+    for name in offsets:
+        if name not in recordings:
+            check.refuse("offsets", f"name recordings ({', '.join(map(str, recordings))})", check.short(name))
+    parts = {}
+    for name, one in recordings.items():
+        if not isinstance(one, tuple) or len(one) != 2:
+            check.refuse(f"recordings[{name!r}]", "be times and channels", check.short(one))
+        t, columns = checked(*one)
+        shift = check.number(f"offsets[{name!r}]", offsets.get(name, 0.0))
+        check.finite(f"offsets[{name!r}]", shift)
+        parts[name] = t + shift, columns
+    if not parts:
+        check.refuse("recordings", "hold at least one", "empty")
+    seen: dict[str, Any] = {}
+    for name, (t, columns) in parts.items():
+        for other, (u, _) in parts.items():
+            if t[0] > u[-1]:
+                must = f"have a time in common with {other!r} (see offsets)"
+                check.refuse(f"recordings[{name!r}]", must, f"from {t[0]:.9g} s on, after its end at {u[-1]:.9g} s")
+        for channel in columns:
+            if channel in seen:
+                check.refuse(
+                    "recordings",
+                    "have channels of different names",
+                    f"of {channel!r} in {seen[channel]!r} and {name!r}",
+                )
+            seen[channel] = name
+    every = np.unique(np.concatenate([t for t, _ in parts.values()]))
+    out = {}
+    for t, columns in parts.values():
+        at = np.searchsorted(every, t)
+        for channel, a in columns.items():
+            out[channel] = np.full(len(every), np.nan)
+            out[channel][at] = a
+    return every, out
 
 
 def checked(t, columns: Mapping[str, Any]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Times and channels of one length as float arrays; NaN in a channel is a missing sample.
 
-    Rows of one time, as several instruments write them, become one, where no channel has two samples.
+    Rows of one time, as several instruments write them, become one, where no channel has two samples. An array (T, k), as a
+    recorder of another simulator keeps a vector, is k channels: ``name.0``, ``name.1``, ...
 
     Raises ValueError for times that are not finite or do not increase, infinite samples, a channel without any
     sample, and lengths that differ. Rows are counted from 0.
@@ -230,6 +339,10 @@ def checked(t, columns: Mapping[str, Any]) -> tuple[np.ndarray, dict[str, np.nda
 
     if (np.diff(t) < 0).any():
         unordered(int(np.flatnonzero(np.diff(t) < 0)[0]) + 1)
+    vectors = {name: a for name, a in columns.items() if np.ndim(a) == 2 and np.shape(a)[0] == len(t)}
+    columns = {name: a for name, a in columns.items() if name not in vectors} | {
+        f"{name}.{i}": part for name, a in vectors.items() for i, part in enumerate(check.real(str(name), a).T)
+    }
     out = {}
     for name, values in columns.items():
         out[name] = a = np.asarray(check.real(name, values), float)
@@ -262,12 +375,13 @@ def unit_quaternions(columns: Mapping[str, Any], names) -> dict[str, np.ndarray]
         The four channels by name, for ``columns | unit_quaternions(columns, names)``.
 
     Raises:
-        ValueError: names that are not four different channels, no complete sample, a length of zero or more than 5 % off the median.
+        ValueError: names that are not four different channels, or say themselves that w is not the first, no complete sample, a length of zero or more than 5 % off the median.
     """
     check.mapping("columns", columns)
     names = list(names) if np.iterable(names) and not isinstance(names, str) else []
     if len(names) != 4 or not all(name in list(columns) and names.count(name) == 1 for name in names):
         check.refuse("names", f"be four different channels ({', '.join(map(str, columns))})", check.short(names))
+    agree("names", [str(name) for name in names], "wxyz")
     parts = [np.asarray(check.real(str(name), columns[name]), float) for name in names]
     if len({part.shape for part in parts}) > 1 or parts[0].ndim != 1:
         check.refuse("names", "be channels of one shape (T,)", f"of shapes {[part.shape for part in parts]}")

@@ -11,7 +11,7 @@ field states (`jaxatt.fields`), an attribute ``units`` in a dataset, part of the
 Times are seconds from 0, the first tick. Numbers keep their type; in CSV they have as many digits as tell them apart from
 their neighbours. Needs the extra ``tables``: pip install 'jaxatt[tables]'.
 
-May import: check, clock, fields, logfiles.
+May import: check, clock, fields, headers.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import numpy as np
 
 from jaxatt import check, fields
 from jaxatt.clock import time_of
-from jaxatt.logfiles import name_and_unit
+from jaxatt.headers import name_and_unit
 
 if TYPE_CHECKING:
     import pandas
@@ -93,7 +93,7 @@ def dataset(
     for name, leaf in leaves.items():
         a = np.asarray(leaf)
         if a.ndim < len(dims) or a.shape[: len(dims)] != shape or 0 in shape:
-            check.refuse(name, f"lead with the axes {dims}, as the others do", f"of shape {a.shape}")
+            check.refuse(f"tree.{name}", f"lead with the axes {dims}, as the others do", f"of shape {a.shape}")
         for place in np.ndindex(a.shape[len(dims) :]):
             column = ".".join([name, *map(str, place)])
             if column in columns:
@@ -183,7 +183,7 @@ def tree_of(data, like):
             check.refuse("data", f"hold {full!r}", f"a table of {check.short(list(data.data_vars))}")
         unit, wanted = data[full].attrs.get("units"), stated.get(full, stated.get(name))
         if unit and wanted and unit != wanted and data[full].dtype != bool and unit != "1":
-            check.refuse(full, f"be given in [{wanted}]", f"in [{unit}]")
+            check.refuse(f"data.{full}", f"be given in [{wanted}]", f"in [{unit}]")
         return data[full].transpose(*dims).values
 
     out = []
@@ -204,7 +204,7 @@ def _typed(name: str, a: np.ndarray, kind) -> np.ndarray:
         with np.errstate(invalid="ignore"):
             there = a.astype(kind)
         if not (there == a).all():
-            check.refuse(name, f"hold numbers of type {kind}", f"{float(a[there != a][0]):g}")
+            check.refuse(f"data.{name}", f"hold numbers of type {kind}", f"{float(a[there != a][0]):g}")
         return there
     return a.astype(kind)
 
@@ -229,7 +229,7 @@ def _flat(data) -> xarray.Dataset:
     columns = {}
     for name, a in data.data_vars.items():
         if missing := [dim for dim in there if dim not in a.dims]:
-            check.refuse(str(name), f"have the axis {missing[0]}, as others do", f"over {a.dims}")
+            check.refuse(f"data.{name}", f"have the axis {missing[0]}, as others do", f"over {a.dims}")
         a = a.transpose(*there, ...)
         for place in np.ndindex(a.shape[len(there) :]):
             columns[".".join([str(name), *map(str, place)])] = there, a.values[(..., *place)], a.attrs
@@ -273,7 +273,7 @@ def _of_frame(table) -> xarray.Dataset:
     known = lambda name: {"units": units[name]} if name in units else {}
     coords = {name: (name, axis, known(name)) for name, axis in zip(there, axes)}
     columns = {
-        str(name): (there, check.real(str(name), table[name].to_numpy()).reshape(shape), known(name))
+        str(name): (there, check.real(f"frame.{name}", table[name].to_numpy()).reshape(shape), known(name))
         for name in table.columns
     }
     return xarray.Dataset(columns, coords)
@@ -351,8 +351,6 @@ def read(path) -> xarray.Dataset:
     try:
         return _flat(readers[path.suffix](path))
     except Exception as error:
-        if isinstance(error, MemoryError):
-            raise
         _no_table(path, error)
 
 

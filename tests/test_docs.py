@@ -26,7 +26,10 @@ SHOWN = {
     for page in ROOT.glob("docs/api/*.md")
     for name, members in re.findall(r"automodule:: (jaxatt[\w.]*)\n(?: +:members: (.*)\n)?", page.read_text())
 }
-INTERNAL = {f"jaxatt.{name}" for name in ("batching", "logfiles", "normal_space", "resuming", "subset")}
+INTERNAL = {
+    f"jaxatt.{name}"
+    for name in ("batching", "headers", "loading", "logfiles", "normal_space", "resuming", "stamps", "subset", "units")
+}
 INTERNAL |= {"jaxatt.loops"}  # how it works inside, and the folder of the loops
 # words of the house, defined where the reference begins (docs/api/index.md)
 HOUSE = set(re.findall(r"^\| `(\w+)`", (ROOT / "docs/api/index.md").read_text(), re.M))

@@ -40,6 +40,7 @@ MEETING = [
     "reliability",
     "replay",
     "sweeping",
+    "tables",
     "tuning",
     "campaign.designs",
     "campaign.summary",

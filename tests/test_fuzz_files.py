@@ -17,7 +17,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxatt.campaign import dataset, extend, rerun, run, sampling_key, scenarios, until
-from jaxatt.replay import load, unit_quaternions
+from jaxatt.replay import Quaternion, load, merged, report, unit_quaternions
+from jaxatt.tables import FORMATS, frame, read, tree_of, write
+from jaxatt.tables import dataset as table_of
 from jaxatt.tuning import tune
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -97,10 +99,18 @@ def odd_logs(draw):
     units=st.sampled_from(
         [{"gyro": "rad/s"}] * 4 + [{}, {"gyro": "deg/s"}, {"star": "1"}, {3: 3}, None, "gyro", {"note": None}, {"q[0]": "1"}]
     ),
-    time=st.sampled_from(["time"] * 4 + ["gyro", "note", "", 3, None]),
+    time=st.sampled_from(["time"] * 4 + ["gyro", "note", "", 3, None, ("time", "note"), ("time",)]),
     how=st.fixed_dictionaries({}, optional=dict(
         stamps=st.sampled_from([None, "s", "ms", "ns", "iso", "min", 3, []]),
         separator=st.sampled_from([",", ";", "\t", " ", "|", "", 3, []]), decimal=st.sampled_from([".", ",", "'", None]),
+        zone=st.sampled_from([None, "+01:00", "Europe/Berlin", "Mars", "../../etc/passwd", 3]), skip=st.sampled_from([0, 1, -1, "a"]),
+        header=st.sampled_from([None, ["time [s]", "gyro [rad/s]", "note"], ["time [s]"], "time", 3, [3]]),
+        encoding=st.sampled_from(["utf-8", "latin-1", "utf-16", "rot13", "base64", "klingon", 3]),
+        told=st.sampled_from([None, {}, {"note": "deg/s"}, {"gyro [rad/s]": "deg/s"}, {"note": 3}, {3: "s"}, "a"]),
+        where=st.sampled_from([None, {"note": "a"}, {"note": 1}, {"gyro [rad/s]": 0}, {"x": 1}, "a"]),
+        missing=st.sampled_from([None, [], [-9999], ["a", 0], [None], "a", 3]),
+        quaternions=st.sampled_from([None, {"q": Quaternion("note", "wxyz", "body to reference")}, {"q": 3}, "q",
+                                     {"q": Quaternion(["time [s]", "gyro", "note", "q[0]"], "xyzw", "reference to body")}]),
     )),
 )  # fmt: skip
 def test_recorded_files(data, name, units, time, how):
@@ -121,8 +131,97 @@ def test_recorded_files(data, name, units, time, how):
             *map(str, how.values()),
             *map(str, units or ()),
             str(time),
+            "where",
+            "stamps",
+            "x",
         }
-        answered(lambda: load(path, units, time=time, **how), words)
+        said = answered(lambda: load(path, units, time=time, **how), words)
+        assert said == answered(lambda: report(path, units, time=time, **how) and None, words)
+
+
+times = st.sampled_from([np.arange(3.0), np.arange(3.0) + 0.5, np.arange(3.0) + 9, [0, 0, 1], [np.nan], "a", None])
+pairs = st.one_of(
+    st.tuples(times, st.sampled_from([{"a": np.ones(3)}, {"b": np.ones(3)}, {"a": np.eye(3)}, {"a": "b"}, {}, 3])), junk
+)
+
+
+@fuzzed
+@given(
+    recordings=st.one_of(st.dictionaries(st.sampled_from(["a", "b", "imu", 3]), pairs, max_size=3), junk),
+    offsets=st.one_of(st.none(), st.dictionaries(st.sampled_from(["a", "imu", 3]), plain(), max_size=2), junk),
+)
+def test_clocks(recordings, offsets):
+    judged(merged, {"recordings", "offsets", "time", "columns", "a", "b", "imu"}, recordings, offsets)
+
+
+# tables
+
+leaves = st.sampled_from(
+    [
+        np.arange(3.0),
+        np.ones((3, 2)),
+        np.arange(3),
+        np.array([True, False, True]),
+        np.ones(2),
+        1.0,
+        "a",
+        None,
+        np.ones(0),
+    ]
+)
+trees = st.one_of(
+    st.dictionaries(st.sampled_from(["a", "b", "w.x", "t", "time", "b [m]", "#", ""]), leaves, max_size=3),
+    st.tuples(leaves, leaves),
+    junk,
+)
+LABELLED = dict(tree={"a": np.arange(3.0), "w": np.ones((3, 2))}, dt=0.1, t=None, dims=("time",), units={"a": "m"})
+ABUSED = dict(
+    tree=trees, dt=plain(), t=st.one_of(st.none(), plain()), dims=st.sampled_from([("time",), ("scenario",), ("scenario", "time"), "time", (), None]),
+    units=st.sampled_from([None, {}, {"a": "m"}, {"c": "m"}, {"a": 3}, {"a": "[m]"}, {"a": "a\nb"}, "m", 3]),
+)  # fmt: skip
+HERE = table_of(LABELLED["tree"], dt=0.1, units={"a": "m"})
+NAMED = {"tree", "dt", "t", "dims", "units", "value", "a", "b", "w", "x", "data", "like", "frame", "path"}
+
+
+@fuzzed
+@given(
+    nearly(LABELLED, ABUSED),
+    st.one_of(trees, st.just({"a": 0.0, "w": np.zeros(2)})),
+    st.sampled_from([HERE, frame(HERE), 3, None, TABLE]),
+)
+def test_tables(how, like, data):
+    judged(lambda: (table_of(**how), None)[1], NAMED, also=())
+    judged(tree_of, NAMED, data, like)
+    judged(lambda: (frame(data), None)[1], NAMED)
+
+
+@pytest.fixture(scope="module")
+def tables_on_disk(tmp_path_factory):
+    folder, found = tmp_path_factory.mktemp("tables"), {}
+    for kind in FORMATS:
+        write(folder / f"a{kind}", HERE)
+        found[kind] = {"": (folder / f"a{kind}").read_bytes()} if kind != ".zarr" else files(folder / "a.zarr")
+    return found
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_spoiled_tables(tables_on_disk, kind):
+    whole = tables_on_disk[kind]
+
+    @fuzzed
+    @given(st.data())
+    def check(data):
+        name = data.draw(st.sampled_from(sorted(whole)))
+        spoilt = whole | {name: data.draw(spoiled(whole[name]))}
+        with TemporaryDirectory() as folder:
+            path = Path(folder, f"a{kind}")
+            for part, content in spoilt.items():
+                at = path / part if part else path
+                at.parent.mkdir(parents=True, exist_ok=True)
+                at.write_bytes(content)
+            answered(lambda: read(path) and None, {"path"})
+
+    check()
 
 
 parts = st.sampled_from([0.0, 1.0, -0.5, 0.707, 32767.0, 1e-300, 1e300, np.nan, np.inf])
@@ -147,6 +246,7 @@ def test_quaternions_of_logs(columns, names):
 def test_what_is_no_path():
     for bad in [b for b in JUNK if not isinstance(b, str)]:
         assert judged(load, {"path"}, bad, {})
+        assert judged(read, {"path"}, bad) and judged(write, {"path"}, bad, HERE) and judged(report, {"path"}, bad, {})
         for f in (dataset, lambda path: run(path, campaign(), 128), lambda path: rerun(path, campaign(), 0)):
             assert judged(f, {"path"}, bad)
 

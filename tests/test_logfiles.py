@@ -8,7 +8,7 @@ from jaxatt.replay import load
 
 NAN = float("nan")
 HEAD = "time [s],g [rad/s]\n"
-DATES = "time,g [rad/s]\n2024-03-01T12:00:00Z,1\n2024-03-01 13:00:00.25+01:00,2\n2024-03-01T12:00:00.500000001,3\n"
+DATES = "time,g [rad/s]\n2024-03-01T12:00:00Z,1\n2024-03-01 13:00:00.25+01:00,2\n2024-03-01T12:00:00.500000001Z,3\n"
 NOON = 1709294400.0  # seconds from 1970 to 2024-03-01T12:00 UTC, by the calendar: 19783.5 days
 
 # what: (text, how it is asked for, times, samples)
@@ -67,7 +67,9 @@ REFUSED = {
     "thousands": (HEAD + '0,"1,234.5"\n', {}, "must hold numbers, but it is '1,234.5' in row 0"),
     "underscores": (HEAD + "0,1_000\n", {}, "must hold numbers, but it is '1_000' in row 0"),
     "another script's digits": (HEAD + "0,٣\n", {}, "must hold numbers"),
-    "a row of units": ("time [s],g [rad/s]\ns,rad/s\n0,1\n", {}, "must hold numbers, but it is 's' in row 0"),
+    "a row of units that are none": ("time [s],g [rad/s]\ns,blips\n0,1\n", {}, "must hold numbers, but it is 's' in row 0"),
+    "a row of units against the header": ("time [s],g [rad/s]\ns,deg/s\n0,1\n", {}, r"`g \[rad/s\]` must have one unit, but it is in \[deg/s\]"),
+    "dates of which some name a zone": (DATES.replace("001Z", "001"), dict(stamps="iso"), "some dates name a zone and some do not.*in row 2"),
     "milliseconds": ("time [ms],g [rad/s]\n0,1\n", {}, r"`time` must be given in \[s\] \(or pass stamps='ms'\)"),
     "milliseconds that are seconds": (HEAD + "0,1\n", dict(stamps="ms"), r"`time` must be given in \[ms\].*'time \[s\]'"),
     "dates": (DATES.replace("time", "time [s]"), {}, r"`time \[s\]` must hold numbers \(pass stamps='iso' for dates\)"),
@@ -116,15 +118,16 @@ def test_a_column_is_asked_for_by_name_and_unit_or_by_its_whole_header(tmp_path,
 @pytest.mark.parametrize(
     ("name", "unit", "message"),
     [
-        ("g [deg/s]", "rad/s", r"`g \[deg/s\]` must be given in \[rad/s\].*'g \[deg/s\]'"),
+        ("g [deg/s]", "rad", r"`g \[deg/s\]` must be given in \[rad\].*'g \[deg/s\]'"),
+        ("g", "mrad/s", r"`g` must be one column of a\.csv \(ask for one by its whole header\)"),
         ("g", "1", r"`g` must be given in \[1\] .*'g \[deg/s\]' and 'g \[rad/s\]'"),
-        ("gx (deg/s)", "rad/s", "must be given in"),
+        ("gx (deg/s)", "rad/s^2", "must be given in"),
         ("plain", "rad/s", r"`plain` must be given in \[rad/s\]"),
         ("q", "0", r"`q \[0\]` must be a column of a\.csv"),
         ("q[2]", "1", "must be a column"),
     ],
 )
-def test_another_unit_is_refused_however_the_column_is_asked_for(tmp_path, name, unit, message):
+def test_a_unit_of_another_quantity_is_refused_however_the_column_is_asked_for(tmp_path, name, unit, message):
     path = tmp_path / "a.csv"
     path.write_text(HEADER + "0,1,2,3,4,5,6,7,8\n")
     with pytest.raises(ValueError, match=message):

@@ -376,7 +376,7 @@ def test_an_empty_cell_is_a_missing_sample(tmp_path):
 
 BAD = {
     "a missing channel": ("time [s],gyro_b [rad/s]\n0,1\n", r"`gyro_a \[rad/s\]` must be a column of a.csv.*gyro_b"),
-    "another unit": ("time [s],gyro_a [deg/s]\n0,1\n", r"`gyro_a` must be given in \[rad/s\].*deg/s"),
+    "another quantity": ("time [s],gyro_a [deg]\n0,1\n", r"`gyro_a` must be given in \[rad/s\].*\[deg\]"),
     "no unit": ("time [s],gyro_a\n0,1\n", r"`gyro_a` must be given in \[rad/s\]"),
     "time in ms": ("time [ms],gyro_a [rad/s]\n0,1\n", r"`time` must be given in \[s\]"),
     "no time": ("t [s],gyro_a [rad/s]\n0,1\n", r"`time \[s\]` must be a column"),

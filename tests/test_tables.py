@@ -175,7 +175,7 @@ REFUSED = {
     "two sorts of times": (lambda: tables.dataset(log(T), dt=0.1), "`dt` must be None, for the tree has times t, but it is 0.1"),
     "times of scores": (lambda: tables.dataset({"a": X}, dims=("scenario",), dt=0.1), "`dt` must be None for scores"),
     "a batch as a run": (lambda: tables.dataset(log(N, T)), r"`t` must have shape \(3,\), but it is of shape \(3, 7\)"),
-    "other axes": (lambda: tables.dataset({"a": X, "b": np.ones(4)}, dt=1.0), r"`b` must lead with the axes .*\(4,\)"),
+    "other axes": (lambda: tables.dataset({"a": X, "b": np.ones(4)}, dt=1.0), r"`tree\.b` must lead with the axes .*\(4,\)"),
     "no dims": (lambda: tables.dataset({"a": X}, dims=("x",), dt=1.0), r"`dims` must be one of .*\('x',\)"),
     "a name twice": (lambda: tables.dataset({"a": {"b": X}, "a.b": X}, dt=1.0), "`tree` must name every number once.*'a.b'"),
     "the name of an axis": (lambda: tables.dataset({"time": X}, dt=1.0), "`tree` must have names .*'time'"),
@@ -186,7 +186,7 @@ REFUSED = {
     "another ending": (lambda: tables.write("a.xlsx", tables.dataset({"a": X}, dt=1.0)), r"`path` must end in one of .*'a.xlsx'"),
     "a number that is missing": (lambda: tables.tree_of(tables.dataset({"a": X}, dt=1.0), {"b": 0.0}), "`data` must hold 'b'"),
     "another unit": (lambda: tables.tree_of(tables.dataset({"w": Vec3(X, X, X)}, dt=1.0, units={"w.x": "deg/s"}), Log(0.0, Vec3(0.0, 0.0, 0.0), *[None] * 5)),  # pyright: ignore
-                     r"`w\.x` must be given in \[rad/s\], but it is in \[deg/s\]"),
+                     r"`data\.w\.x` must be given in \[rad/s\], but it is in \[deg/s\]"),
     "a flag that is none": (lambda: tables.tree_of(tables.dataset({"a": X}, dt=1.0), {"a": np.bool_(True)}), "type bool, but it is 2"),
 }  # fmt: skip
 
