@@ -31,7 +31,7 @@ LISTED = 5  # gaps that a report lists
 class Quaternion(NamedTuple):
     """How a file holds an attitude: told once, checked against the names of the columns, never guessed."""
 
-    columns: Any  # headers of the four, or the name of a column of arrays
+    columns: Any  # headers (4,), or the name of a column of arrays
     order: str  # "wxyz": the scalar comes first, "xyzw": last
     direction: str  # "body to reference": its matrix takes body components to reference components, or the other way
 
