@@ -62,7 +62,7 @@ def column(file: str, header: list[str], separator: str, name: str, unit: str | 
         return Taken((i,), "", said, (1.0 if unit is None else units.factor(said, unit)) or 1.0)
     for i in whole:  # a whole header tells that its brackets hold no unit
         if known[i][1] is None and (unit == "1" or name.endswith((")", "]"))):
-            if (ending := units.of_ending(name)) and units.factor(ending, unit) != 1.0:
+            if (ending := units.of_name(name)) and units.factor(ending, unit) != 1.0:
                 check.refuse(
                     name,
                     f"be given in [{unit}] by {file}",
@@ -70,7 +70,7 @@ def column(file: str, header: list[str], separator: str, name: str, unit: str | 
                 )
             return Taken((i,), "", unit)
     if others:
-        ending = units.of_ending(header[others[0]]) if known[others[0]][1] is None else None
+        ending = units.of_name(header[others[0]]) if known[others[0]][1] is None else None
         way_out = f" (pass told={{{header[others[0]]!r}: {ending!r}}})" if ending else ""
         must = f"be given in [{unit}] by {file}{way_out}"
         check.refuse(name, must, f"in the column {' and '.join(repr(header[i]) for i in others)}")
@@ -90,7 +90,7 @@ def _said(header: str, said: str | None, told: Mapping[str, str]) -> str | None:
     """The unit of a column by its header, or as told; refuses what contradicts the header or the end of its name."""
     if header not in told:
         return said
-    other = said or units.of_ending(header)
+    other = said or units.of_name(header)
     if other and units.factor(other, told[header]) != 1.0:
         check.refuse(f"told[{header!r}]", f"be [{other}], as the header says", repr(told[header]))
     return told[header]
@@ -123,7 +123,7 @@ def time_column(file: str, header: list[str], separator: str, time, stamps: str 
     for i in mine if stamps else ():
         said = sort(known[i][1])
         if said == stamps or (said not in STAMPS and (said is None or stamps == "iso")):
-            ending = units.of_ending(header[i])
+            ending = units.of_name(header[i])
             if ending in ("s", "ms", "us", "ns") and stamps != ending:
                 check.refuse(time, f"be given in [{stamps}]", f"in [{ending}] by its name, {header[i]!r}")
             return Taken((i,), "", stamps)
@@ -142,7 +142,7 @@ def _pair(file: str, header: list[str], time, stamps: str | None) -> Taken:
         here = [i for i, other in enumerate(header) if other and one in (other, name_and_unit(other)[0])]
         if len(here) != 1:
             check.refuse("time", f"name columns of {file}", repr(one))
-        said = name_and_unit(header[here[0]])[1] or units.of_ending(header[here[0]])
+        said = name_and_unit(header[here[0]])[1] or units.of_name(header[here[0]])
         if wanted and said and units.factor(said, wanted) != 1.0:
             check.refuse("time", f"name the columns of seconds and of nanoseconds of {file}", f"{one!r} in [{said}]")
         at += here

@@ -17,13 +17,12 @@ import numpy as np
 from jaxatt import check
 from jaxatt.headers import column, name_and_unit, time_column
 from jaxatt.logfiles import Contents, Layout, checked_layout, read
-from jaxatt.stamps import plausible
+from jaxatt.stamps import agrees, plausible
 
 ORDERS, DIRECTIONS = ("wxyz", "xyzw"), ("body to reference", "reference to body")
-# numbers that loggers write where there is no sample; taken for that where all others are ten times smaller
-MARKS = np.array(
-    [999, 9999, 99999, 999999, 32767, 32768, 65535, 2147483647, 2147483648, 1e20, 1e30, 9.9692099683868690e36]
-)
+# numbers that loggers write where there is no sample; taken for that where all others are ten times smaller, or there are none
+MARKS = np.array([999, 999.9, 999.99, 9999, 9999.9, 9999.99, 99999, 99999.9, 99999.99, 999999, 32767, 32768, 65535, 2147483647,
+                  2147483648, 1e20, 1e30, 9.9692099683868690e36])  # fmt: skip
 GAP = 1.5  # median steps that are a gap
 LISTED = 5  # gaps that a report lists
 
@@ -82,6 +81,9 @@ def understood(path, wanted: Mapping, time, layout: Layout, told, quaternions) -
 
     contents = read(path, pick, layout)
     t, *values = contents.columns
+    if layout.missing is None:
+        for name, a in zip(asked, values):
+            _no_marks(name, a)
     columns = {
         name: one.factor * a if one.factor != 1 else a for name, one, a in zip(asked, contents.taken[1:], values)
     }
@@ -91,13 +93,12 @@ def understood(path, wanted: Mapping, time, layout: Layout, told, quaternions) -
         marks = {name: [cell for cell, keep in zip(cells, kept) if keep] for name, cells in contents.marks.items()}
         t, columns, contents = t[kept], {name: a[kept] for name, a in columns.items()}, contents._replace(marks=marks)
     plausible(headers[0], layout.stamps or "s", t)
+    if layout.stamps == "iso" and not contents.zoned:
+        agrees(headers[0], layout.zone)
     found = Understood(
         path.name, contents, layout, headers[0], dict(zip(asked, headers[1:])), t, columns, dict(quaternions), parts
     )
     _one_instrument(found)
-    if layout.missing is None:
-        for name, a in columns.items():
-            _no_marks(name, a)
     return found
 
 
@@ -142,7 +143,10 @@ def agree(name: str, four: Sequence[str], order: str) -> None:
 
 def part_of(header: str) -> str | int | None:
     """What a name says that a part of a quaternion is: "w", "x", "y", "z", its number, or nothing."""
-    name = name_and_unit(header)[0].strip().lower()
+    name = name_and_unit(header)[0].strip()
+    if camel := re.search(r"[a-z0-9]([WXYZ])$", name):
+        return camel[1].lower()
+    name = name.lower()
     if found := re.search(r"(?:^|[^a-z0-9]|q|quat|quaternion)(w|x|y|z|i|j|k|s|scalar|real)[\])]?$", name):
         return {"i": "x", "j": "y", "k": "z", "s": "w", "scalar": "w", "real": "w"}.get(found[1], found[1])
     if found := re.search(r"(?<!\d)(\d)[\])]?$", name):
@@ -170,7 +174,7 @@ def _no_marks(name: str, a: np.ndarray) -> None:
     size = np.abs(a)
     near = (np.abs(size[:, None] - MARKS) <= 1e-6 * MARKS).any(axis=1)
     others = size[np.isfinite(size) & ~near]
-    if near.any() and len(others) and 10 * others.max() < size[near].min():
+    if near.any() and (len(others) == 0 or 10 * others.max() < size[near].min()):
         row = int(np.flatnonzero(near)[0])
         mark = f"{a[row]:.9g}"
         must = f"hold samples (pass missing=[{mark}] where that marks missing ones, missing=[] where it is a sample)"

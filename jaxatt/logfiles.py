@@ -50,7 +50,8 @@ MISSING = frozenset(
 # the last word of a column that says which instrument a row is of
 INSTRUMENTS = {
     "id", "sensor", "sensorid", "sensor_id", "instrument", "device", "deviceid", "device_id", "imu", "imuid", "imu_id", "source", "channel",
-    "topic", "instance",
+    "topic", "instance", "name", "type", "msg", "message", "msgtype", "msg_type", "signal", "parameter", "variable", "quantity", "axis", "unit",
+    "units", "frame_id", "node", "kind",
 }  # fmt: skip
 CHUNK = 10_000  # rows that are held as text at a time
 
@@ -77,6 +78,7 @@ class Contents(NamedTuple):
     columns: list[np.ndarray]
     marks: dict[str, list[str]]  # cells of the columns that nobody asks for and that tell instruments apart
     rows: int  # of the file, those that `where` leaves out too
+    zoned: bool  # whether its dates name their zone
 
 
 def checked_layout(layout: Layout) -> Layout:
@@ -160,8 +162,10 @@ def _chosen(
 
 
 def _holds(cell: str, value) -> bool:
-    """Whether a cell is what `where` tells: the same text, or the same number."""
-    with suppress(ValueError):
+    """Whether a cell is what `where` tells, or one of it: the same text, or the same number."""
+    if isinstance(value, (list, tuple, set, frozenset)):
+        return any(_holds(cell, one) for one in value)
+    with suppress(ValueError, TypeError):
         return cell.strip() == str(value) or float(cell) == float(value)
     return False
 
@@ -208,7 +212,7 @@ def _text(name: str, file, pick: Callable, layout: Layout, cells: _Cells) -> Con
     convert()
     if where and count and not sum(len(a) for a in parts[0]):
         check.refuse("where", f"hold in some row of {name}", check.short(dict(layout.where or {})))
-    return Contents(header, taken, [np.concatenate(part) for part in parts], marks, count)
+    return Contents(header, taken, [np.concatenate(part) for part in parts], marks, count, True in cells.zoned)
 
 
 def _headed(name: str, rows: Iterator, layout: Layout) -> tuple[list[str], Iterator]:
@@ -310,12 +314,20 @@ def _parquet(name: str, table, header: list[str], pick: Callable, layout: Layout
     found = []
     for n, one in enumerate(taken):
         given = [columns[i][kept] for i in one.at]
+        aware = getattr(table.column(one.at[0]).type, "tz", None) is not None
         if len(given) > 1:
             texts = [JOINED[layout.stamps or "iso"].join(map(str, row)) for row in zip(*given)]
             found.append(cells.numbers(header[one.at[0]], texts, "", True, rows))
         else:
-            found.append(cells.array(header[one.at[0]], given[0], one.part, n == 0, rows))
-    return Contents(header, taken, found, {header[i]: [marks[i][row] for row in rows] for i in marked}, table.num_rows)
+            found.append(cells.array(header[one.at[0]], given[0], one.part, n == 0, rows, aware))
+    return Contents(
+        header,
+        taken,
+        found,
+        {header[i]: [marks[i][row] for row in rows] for i in marked},
+        table.num_rows,
+        True in cells.zoned,
+    )
 
 
 # cells
@@ -329,7 +341,8 @@ class _Cells:
         marks = [str(mark).strip().lower() for mark in layout.missing or ()]
         self.words = MISSING | set(marks)
         self.marks = [float(mark) for mark in marks if _goes(float, mark)]
-        self.stamp = reader(self.stamps, self.number, self.missing, zone_of(layout.zone))
+        self.zoned: set[bool] = set()  # whether dates name a zone
+        self.stamp = reader(self.stamps, self.number, self.missing, zone_of(layout.zone), self.zoned)
 
     def missing(self, cell: str) -> bool:
         return cell.strip().lower() in self.words
@@ -357,7 +370,7 @@ class _Cells:
     def numbers(self, name: str, cells: list[str], part: str, stamp: bool, rows: Sequence[int]) -> np.ndarray:
         """Cells of a column as numbers, of stamps in seconds; rows: their numbers."""
         if part:
-            return self._elements(name, [_elements_of(cell) for cell in cells], part, rows)
+            return self._elements(name, [_elements_of(cell, self.decimal) for cell in cells], part, rows)
         number = self.stamp if stamp else self.number
         row, cell, why = 0, "", ""
         out = np.empty(len(cells))
@@ -372,7 +385,7 @@ class _Cells:
         way_out = ""
         if stamp and self.stamps != "iso" and re.match(r"\d{4}-?\d\d-?\d\d[T ]", cell.strip()):
             way_out = " (pass stamps='iso' for dates)"
-        elif not stamp and cell.strip()[:1] in "[(" and _elements_of(cell):
+        elif not stamp and cell.strip()[:1] in "[(" and _elements_of(cell, self.decimal):
             way_out = f" (ask for an element, '{name_and_unit(name)[0]}.0')"
         elif self.decimal == "." and _goes(lambda cell: self.number(cell, ","), cell):
             way_out = " (pass decimal=',' for decimal commas)"
@@ -399,8 +412,8 @@ class _Cells:
             out[n : n + 1] = self.numbers(name, ["" if one is None else str(one)], "", False, rows[n : n + 1])
         return out
 
-    def array(self, name: str, a: np.ndarray, part: str, stamp: bool, rows: Sequence[int]) -> np.ndarray:
-        """A column of a Parquet file."""
+    def array(self, name: str, a: np.ndarray, part: str, stamp: bool, rows: Sequence[int], aware: bool) -> np.ndarray:
+        """A column of a Parquet file; aware: its dates name a zone."""
         if part:
             given = [{} if cell is None else cell if isinstance(cell, dict) else None if isinstance(cell, (str, float, int)) else list(cell) for cell in a.tolist()]  # fmt: skip
             if not all(isinstance(cell, (list, dict)) for cell in given):
@@ -409,6 +422,13 @@ class _Cells:
         if a.dtype.kind == "M" and stamp:
             if self.stamps != "iso":
                 check.refuse(name, "hold numbers (pass stamps='iso' for dates)", f"of type {a.dtype}")
+            if self.zone and not aware:
+                return self.numbers(
+                    name, ["" if np.isnat(cell) else str(cell) for cell in a.astype("datetime64[ns]")], "", True, rows
+                )
+            if self.zone:
+                check.refuse("zone", "be None, for the dates name theirs", repr(self.zone))
+            self.zoned.add(aware)
             a = a.astype("datetime64[ns]")
             return np.where(np.isnat(a), np.nan, _seconds(a.astype(np.int64), STAMPS["ns"]))
         if a.dtype.kind in "biuf" and not (stamp and self.stamps == "iso"):
@@ -420,8 +440,12 @@ class _Cells:
         return self.numbers(name, ["" if cell is None else str(cell) for cell in a], "", stamp, rows)
 
 
-def _elements_of(cell: str) -> list[str] | None:
-    """The elements of a cell such as "[0.1 0.2 0.3]"; empty for an empty one, None for what is no array."""
+def _elements_of(cell: str, decimal: str = ".") -> list[str] | None:
+    """The elements of a cell such as "[0.1 0.2 0.3]"; empty for an empty one, None for what is no array.
+
+    One sign stands between all of them: what could be decimal commas is no array unless they are told, and then commas
+    stand between no elements that no space parts.
+    """
     cell = cell.strip()
     if cell.lower() in MISSING:
         return []
@@ -429,7 +453,15 @@ def _elements_of(cell: str) -> list[str] | None:
     if not found or len(found[1]) != len(found[3]):
         return None
     text = found[2].strip()
-    return [part.strip() for part in re.split(r"\s*[,;]\s*|\s+", text)] if text else []
+    if not text:
+        return []
+    between = {re.sub(r"\s+", " ", sign) for sign in re.findall(r"\s*[,;]\s*|\s+", text)}
+    if decimal == ",":
+        between = {re.sub(r"\s+", " ", sign) for sign in re.findall(r"\s*;\s*|,?\s+", text)}
+        if len(between) > 1 or (not between and "," in text):
+            return None
+        return re.split(r"\s*;\s*|,?\s+", text)
+    return re.split(r"\s*[,;]\s*|\s+", text) if len(between) <= 1 else None
 
 
 def _seconds(a: np.ndarray, parts) -> np.ndarray:

@@ -54,16 +54,16 @@ def _offset(text: str) -> timezone:
 
 
 def reader(
-    stamps: str, number: Callable[[str], float], missing: Callable[[str], bool], zone: tzinfo | None
+    stamps: str, number: Callable[[str], float], missing: Callable[[str], bool], zone: tzinfo | None, named: set[bool]
 ) -> Callable:
     """What turns a cell into seconds; whole numbers are divided exactly, and ValueError is raised for what is no stamp.
 
     number: (cell) -> float; missing: whether a cell says that there is nothing, which becomes NaN; zone: that of dates which
-    name none, UTC for None. Dates with and without a zone in one column are refused, and dates of another zone than told.
+    name none, UTC for None; named: filled with whether they do. Dates with and without a zone in one column are refused, and
+    dates of another zone than told.
     """
     whole = re.compile(r"\s*[+-]?\d+\s*", re.ASCII).fullmatch
     if stamps == "iso":
-        named: set[bool] = set()
 
         def date(cell: str) -> float:
             if missing(cell.strip("T ")):
@@ -134,3 +134,20 @@ def plausible(name: str, stamps: str, t: np.ndarray) -> None:
     steps = np.diff(np.unique(known))
     if stamps != "iso" and len(steps) and np.median(steps) < CLOSEST:
         check.refuse(name, f"be stamps in [{stamps}] that are a microsecond apart", f"{np.median(steps):.3g} s apart")
+
+
+def agrees(header: str, zone: str | None) -> None:
+    """Refuse a header of dates without zones that says another zone than is told: "time (UTC)", "LocalTime", "t [UTC+1]"."""
+    plain = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", header)
+    found = re.search(r"(?<![A-Za-z])(UTC|GMT)?\s*([+-])(\d{1,2})(?::?(\d\d))?(?!\d)", plain, re.I)
+    inside = re.search(r"[\[(]([A-Z]{2,5})[\])]\s*$", header)
+    if found and (found[1] or re.search(r"[\[(][+-]", header)):
+        said = f"{found[2]}{int(found[3]):02d}:{found[4] or '00'}"
+        told = zone_of(zone)
+        if told is None or (isinstance(told, timezone) and told != zone_of(said)):
+            check.refuse("zone", f"be {said!r}, as the header {header!r} says", repr(zone))
+    elif re.search(r"(?<![A-Za-z])(UTC|GMT|Zulu)(?![A-Za-z])", plain, re.I):
+        if zone_of(zone) not in (None, UTC):
+            check.refuse("zone", f"be 'UTC', as the header {header!r} says", repr(zone))
+    elif zone is None and (inside or re.search(r"(?<![A-Za-z])local(?![A-Za-z])", plain, re.I)):
+        check.refuse("zone", f"be told, such as '+01:00', for the header is {header!r}", "None")

@@ -59,11 +59,20 @@ def known(text: str) -> bool:
     return not re.fullmatch(r"[\d.,+\-\s]*", text) and _parsed(text) is not None
 
 
-def of_ending(name: str) -> str | None:
-    """The unit that the end of a name says, as "gyro_x_deg_s" and "GyroX_dps" do; None where it says none."""
-    words = re.split(r"[_ .]+", re.sub(r"[\[(].*", "", name).strip())
-    endings = ("_".join(words[-n:]) for n in (3, 2, 1) if len(words) > n)
-    return next((_ENDINGS[ending.lower()] for ending in endings if ending.lower() in _ENDINGS), None)
+def of_name(name: str) -> str | None:
+    """The unit that a header says in other ways than in brackets at its end; None where it says none.
+
+    As in "gyro_x_deg_s", "gyroXDegPerSec", "gyro:deg/s", "gyro, deg/s", "gyro / (deg/s)", "gyro <deg/s>", "gyro [deg/s] (x)".
+    """
+    inside = [*re.findall(r"[\[(<{]([^\[\](){}<>]*)[\])>}]", name), *re.findall(r"(?:[:,|]|\s/)\s*([^:,|]+)$", name)]
+    if found := [word.strip() for word in inside if known(word.strip())]:
+        return found[0]
+    plain = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", "_", re.sub(r"[\[(<{].*", "", name).strip())
+    for words in (re.split(r"[_ .]+", re.sub(r"[\[(<{].*", "", name).strip()), re.split(r"[_ .]+", plain)):
+        endings = ("_".join(words[-n:]).lower() for n in (3, 2, 1) if len(words) > n)
+        if said := next((_ENDINGS[ending] for ending in endings if ending in _ENDINGS), None):
+            return said
+    return None
 
 
 @lru_cache(1000)

@@ -4,7 +4,7 @@ from math import pi
 
 import pytest
 
-from jaxatt.units import factor, known, of_ending
+from jaxatt.units import factor, known, of_name
 
 DEG = pi / 180
 
@@ -40,5 +40,30 @@ def test_texts_that_are_units_and_names_that_end_in_one():
         "deg/s",
         "m/s²",
     ]
-    names = ("gyro_x_deg_s", "GyroX_dps", "time_ms", "t.us", "q_s", "gx", "w_rad_s (x)", "ms", "B_nT", "omega_x")
-    assert [of_ending(name) for name in names] == ["deg/s", "deg/s", "ms", "us", None, None, "rad/s", None, "nT", None]
+    names = (
+        "gyro_x_deg_s",
+        "GyroX_dps",
+        "gyroXDegPerSec",
+        "timeMs",
+        "t.us",
+        "w_rad_s (x)",
+        "g:deg/s",
+        "g, rad/s",
+        "g / (deg/s)",
+        "g <mT>",
+    )
+    assert [of_name(name) for name in names] == [
+        "deg/s",
+        "deg/s",
+        "deg/s",
+        "ms",
+        "us",
+        "rad/s",
+        "deg/s",
+        "rad/s",
+        "deg/s",
+        "mT",
+    ]
+    assert of_name("g [deg/s] (x)") == "deg/s" and not any(
+        map(of_name, ("q_s", "gx", "ms", "omega_x", "q[0]", "w (x)", "share [1]", "a:b"))
+    )
