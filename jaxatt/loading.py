@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from datetime import UTC, datetime
 from typing import Any, NamedTuple
 
@@ -16,7 +17,7 @@ import numpy as np
 
 from jaxatt import check
 from jaxatt.headers import column, name_and_unit, time_column
-from jaxatt.logfiles import Contents, Layout, checked_layout, read
+from jaxatt.logfiles import CLOCK, INSTRUMENTS, Contents, Layout, checked_layout, read
 from jaxatt.stamps import agrees, plausible
 
 ORDERS, DIRECTIONS = ("wxyz", "xyzw"), ("body to reference", "reference to body")
@@ -99,6 +100,7 @@ def understood(path, wanted: Mapping, time, layout: Layout, told, quaternions) -
         path.name, contents, layout, headers[0], dict(zip(asked, headers[1:])), t, columns, dict(quaternions), parts
     )
     _one_instrument(found)
+    _one_clock(found)
     return found
 
 
@@ -157,12 +159,45 @@ def part_of(header: str) -> str | int | None:
 def _one_instrument(found: Understood) -> None:
     """Refuse a channel whose samples are of several instruments."""
     for header, cells in found.contents.marks.items():
+        if re.split(r"[./]", header)[-1].strip().lower() not in INSTRUMENTS:
+            continue
         for name, a in found.columns.items():
             here = np.array(cells)[~np.isnan(a)] if len(cells) else np.array([])
             kinds = np.unique(here)
             if 1 < len(kinds) < len(here) or (len(kinds) > 1 and len(kinds) == len(here) and not _counts(kinds)):
                 must = f"be of one instrument: say which, where={{{header!r}: {str(kinds[0])!r}}}"
                 check.refuse(name, must, f"of {len(kinds)} by the column {header!r}: {', '.join(kinds[:4])}")
+
+
+def _one_clock(found: Understood) -> None:
+    """Refuse a channel that stands behind the times of another clock, which do not go with those that were asked for."""
+    header, taken = found.contents.header, found.contents.taken
+    clocks = {header.index(name) for name in found.contents.marks if CLOCK.fullmatch(name_and_unit(name)[0])} | set(
+        taken[0].at
+    )
+    for name, one in zip(found.columns, taken[1:]):
+        nearest = max((i for i in clocks if i < one.at[0]), default=taken[0].at[0])
+        if nearest in taken[0].at:
+            continue
+        other = np.array([_instant(cell, found.layout.decimal) for cell in found.contents.marks[header[nearest]]])
+        both = np.isfinite(other) & np.isfinite(found.t)
+        if both.sum() < 2 or np.ptp(found.t[both]) == 0:
+            continue
+        pace = np.ptp(other[both]) / np.ptp(found.t[both])
+        if not any(abs(pace / unit - 1) < 0.01 for unit in (1, 1e3, 1e6, 1e9, 1e-3, 1e-6, 1e-9)):
+            must = f"be stamped by its own clock: load it with time={header[nearest]!r} and join both by `merged`"
+            check.refuse(name, must, f"behind that column, which goes {pace:.4g} times as fast as {found.time!r}")
+
+
+def _instant(cell: str, decimal: str) -> float:
+    """A stamp of any kind as a number; NaN for what is none."""
+    for read in (
+        lambda: float(cell.replace(",", ".") if decimal == "," else cell),
+        lambda: datetime.fromisoformat(cell).timestamp(),
+    ):
+        with suppress(ValueError):
+            return number()
+    return np.nan
 
 
 def _counts(kinds) -> bool:

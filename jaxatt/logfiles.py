@@ -53,6 +53,10 @@ INSTRUMENTS = {
     "topic", "instance", "name", "type", "msg", "message", "msgtype", "msg_type", "signal", "parameter", "variable", "quantity", "axis", "unit",
     "units", "frame_id", "node", "kind",
 }  # fmt: skip
+# the name of a column of times
+CLOCK = re.compile(
+    r"(?i:(t|time|timestamp|stamp|clock)([ _.].*)?|.*[ _.](t|time|timestamp|stamp|clock))|time[A-Z].*|.*[a-z](Time|Timestamp|Stamp)"
+)
 CHUNK = 10_000  # rows that are held as text at a time
 
 
@@ -76,7 +80,7 @@ class Contents(NamedTuple):
     header: list[str]
     taken: list[Taken]
     columns: list[np.ndarray]
-    marks: dict[str, list[str]]  # cells of the columns that nobody asks for and that tell instruments apart
+    marks: dict[str, list[str]]  # cells of the columns that nobody asks for and that tell instruments or clocks apart
     rows: int  # of the file, those that `where` leaves out too
     zoned: bool  # whether its dates name their zone
 
@@ -158,7 +162,8 @@ def _chosen(
         where[header.index(column)] = value
     asked = {i for one in taken for i in one.at} | set(where)
     last = [re.split(r"[./]", column)[-1].strip().lower() for column in header]
-    return taken, where, [i for i, word in enumerate(last) if word in INSTRUMENTS and i not in asked]
+    clocks = [CLOCK.fullmatch(name_and_unit(column)[0]) is not None for column in header]
+    return taken, where, [i for i, word in enumerate(last) if (word in INSTRUMENTS or clocks[i]) and i not in asked]
 
 
 def _holds(cell: str, value) -> bool:

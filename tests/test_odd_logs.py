@@ -114,6 +114,9 @@ READ = {
     "naive dates of Parquet, the zone told": (
         pandas.DataFrame({"time": pandas.to_datetime(NOON + 3600 + T, unit="s").round("ms"), **{f"{a} [deg/s]": W[:, i] for i, a in enumerate(AXES)}}),
         DEG, dict(stamps="iso", zone="+01:00"), NOON + T),
+    "two stamps of each row, in ms and as dates": (
+        lines(["time [s]", "seq", "stamp [ms]", "utc_time", *(f"{a} [deg/s]" for a in AXES)],
+              [[row[0], 1, f"{1e3 * t + 7:.0f}", f"2024-03-01T12:00:0{t:.2f}", *row[1:]] for t, row in zip(T, rows())]), DEG, {}, T),
     "all of several kinds of rows, told": (
         lines(["time [s]", "type", *(f"{a} [deg/s]" for a in AXES)], [[row[0], kind, *row[1:]] for row, kind in zip(rows(), "abab")]), DEG,
         dict(where={"type": ["a", "b"]}), T),
@@ -193,6 +196,9 @@ REFUSED = {
     "a header that says another zone": (lines(["time (UTC)", *RATES], rows(at_noon("2024-03-01T{}"))), DEG, dict(stamps="iso", zone="+01:00"),
                                         "`zone` must be 'UTC', as the header"),
     "a zone by its letters": (lines(["time (CET)", *RATES], rows(at_noon("2024-03-01T{}"))), DEG, dict(stamps="iso"), "`zone` must be told"),
+    "the channel of another clock beside": (
+        lines(["t_gyro [s]", "x [deg/s]", "t_star [s]", "star [deg]"], [[row[0], row[1], 0.2 * i, i] for i, row in enumerate(rows())]),
+        {"x": "deg/s", "star": "deg"}, dict(time="t_gyro"), r"`star` must be stamped by its own clock: load it with time='t_star .s.'"),
     "nanoseconds before seconds": (lines(["secs", "nsecs", "x [deg/s]"], [[1, 2, 3]]), {"x": "deg/s"}, dict(time=("x", "secs"), stamps="s+ns"),
                                    "`time` must name the columns of seconds"),
     "an array as a number": (lines(["time [s]", "w [deg/s]"], [["0", '"[1, 2]"']]), {"w": "deg/s"}, {}, r"ask for an element, 'w.0'\)"),
