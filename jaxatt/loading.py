@@ -191,7 +191,7 @@ def _one_clock(found: Understood) -> None:
 
 def _instant(cell: str, decimal: str) -> float:
     """A stamp of any kind as a number; NaN for what is none."""
-    for read in (
+    for number in (
         lambda: float(cell.replace(",", ".") if decimal == "," else cell),
         lambda: datetime.fromisoformat(cell).timestamp(),
     ):

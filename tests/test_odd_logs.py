@@ -112,7 +112,7 @@ READ = {
     "a header that says the zone, as told": (lines(names("{} [deg/s]", "time [UTC+1]"), rows(lambda t: f"2024-03-01 13:00:0{t:.2f}")), DEG,
                                              dict(stamps="iso", zone="+01:00"), NOON + T),
     "naive dates of Parquet, the zone told": (
-        pandas.DataFrame({"time": pandas.to_datetime(NOON + 3600 + T, unit="s").round("ms"), **{f"{a} [deg/s]": W[:, i] for i, a in enumerate(AXES)}}),
+        pandas.DataFrame({"time": pandas.to_datetime(np.round(1e3 * (NOON + 3600 + T)), unit="ms"), **{f"{a} [deg/s]": W[:, i] for i, a in enumerate(AXES)}}),
         DEG, dict(stamps="iso", zone="+01:00"), NOON + T),
     "two stamps of each row, in ms and as dates": (
         lines(["time [s]", "seq", "stamp [ms]", "utc_time", *(f"{a} [deg/s]" for a in AXES)],
