@@ -71,6 +71,9 @@ READ = {
         lines(names("{} [deg/s]", "time [s]"), rows(), "\t", before=("// General information:", "//  Firmware: 4.0", "// Rate: 100")),
         RAD, dict(separator="\t"), T),
     "savetxt: header behind a hash": (lines(names("{} [deg/s]", "# time [s]"), rows()), RAD, {}, T),
+    "TUM: header behind a hash, spaces": (
+        lines(names("w{}", "# timestamp"), rows(lambda t: f"{NOON + t:.2f}"), " ", before=("# angular velocity", "# of an IMU")),
+        {f"w{a}": "deg/s" for a in AXES}, dict(time="timestamp", stamps="s", separator=" ", told={f"w{a}": "deg/s" for a in AXES}), NOON + T),
     "no header: names told": (lines(rows()[0], rows()[1:]), RAD, dict(header=["time [s]", *(f"{a} [deg/s]" for a in AXES)]), T),
     "lines before the header": (lines(names("{} [deg/s]", "time [s]"), rows(), before=("Logger 7", "SN;12;34")), RAD, dict(skip=2), T),
     "a row of units": (lines(names("{}", "time"), [["s", "deg/s", "deg/s", "deg/s"], *rows()]), RAD, {}, T),

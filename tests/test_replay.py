@@ -191,7 +191,7 @@ def test_a_file_brings_back_the_readings_and_with_them_the_computer_of_the_close
         for a, b in zip(jax.tree.leaves((run.told, run.between)), jax.tree.leaves((told, between)), strict=True):
             assert a.dtype == b.dtype
             np.testing.assert_array_equal(a, b, kind)
-    grid = dict(dt=case.system.dt, flow=case.flow, substeps=case.system.substeps, between=between)
+    grid: dict[str, Any] = dict(dt=case.system.dt, flow=case.flow, substeps=case.system.substeps, between=between)
     computers, _ = replay(case.decide, case.loop.params, run.start, told, **grid)
     # what microsat states in units of its sensors' noise, 1e-6 and less, has the rounding of two programs so much larger
     counted = {"wheel", "gyro", "nis"} if case.loop is microsat else set()
