@@ -16,6 +16,7 @@ May import: check, clock, fields, headers.
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -371,20 +372,34 @@ def _place(path) -> Path:
 def _read_rows(path: Path):
     import pandas
 
-    with path.open("rb") as file:
-        if path.suffix == ".csv":
-            text: dict[str, Any] = dict(float_precision="round_trip", na_values=["nan"], keep_default_na=False)
-            table = pandas.read_csv(file, index_col=False, **text)
-        else:
-            import pyarrow.parquet
+    if path.suffix == ".csv":
+        with path.open(newline="", encoding="utf-8") as file:
+            header, *rows = csv.reader(file, strict=True)
+        columns = [_of_words(cells) for cells in zip(*rows, strict=True)]
+        table = pandas.concat([pandas.Series(a, name=name) for name, a in zip(header, columns, strict=True)], axis=1)
+    else:
+        import pyarrow.parquet
 
+        with path.open("rb") as file:
             table = pyarrow.parquet.read_table(file).to_pandas()
     known = dict(name_and_unit(str(header)) for header in table.columns)
+    if len(known) < len(table.columns):
+        raise ValueError("a column stands in it twice")
     table.columns = list(known)
     units = {name: unit for name, unit in known.items() if unit}
     table = table.set_index([name for name in ("scenario", "time") if name in known])
     table.attrs["units"] = units
     return _of_frame(table)
+
+
+def _of_words(cells: tuple[str, ...]) -> np.ndarray:
+    """A column of text as what was written: flags, whole numbers, or floats to the last bit."""
+    if set(cells) <= {"True", "False"}:
+        return np.array([cell == "True" for cell in cells])
+    try:
+        return np.array([int(cell) for cell in cells])
+    except ValueError:
+        return np.array([float(cell) for cell in cells])
 
 
 def _read_netcdf(path: Path):

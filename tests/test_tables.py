@@ -208,6 +208,9 @@ def test_files_that_are_none_are_refused_and_folders_are_kept(tmp_path):
         path.write_bytes(b"\x80\x04K\x01." * 3)
         with pytest.raises(ValueError, match=rf"`path` must be a table of jaxatt\.tables, but a{kind} is none"):
             tables.read(path)
+    (tmp_path / "a.csv").write_text("time [s],a [m],a [m]\n0.0,1.0,2.0\n")
+    with pytest.raises(ValueError, match="a column stands in it twice"):
+        tables.read(tmp_path / "a.csv")
     with pytest.raises(ValueError, match="`path` must be a folder that is not there yet"):
         tables.write(tmp_path / "a.zarr", data)
     with pytest.raises(ValueError, match=r"`n` must hold whole numbers that a float can hold, in \.nc"):
