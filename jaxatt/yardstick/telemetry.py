@@ -8,6 +8,7 @@ May import: leo4, steady, vec, sensors.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -99,7 +100,8 @@ def residuals_step(state: Residuals, telemetry: Telemetry) -> tuple[Residuals, A
     return Residuals(baseline, jnp.minimum(seen + 1, 1e6), w, a), r
 
 
-class OnResiduals(NamedTuple):
+@dataclass(frozen=True)  # JAX refers to functions weakly, and no tuple can be
+class OnResiduals:
     """A detector's step that sees the residuals of the packet too; several in one sweep share them.
 
     Its state is (`Residuals`, z), as `with_residuals` starts it.
