@@ -19,7 +19,7 @@ MACHINE = ("seconds", "machine", "nanoseconds")  # fields of a card that another
 
 
 class Pairs(NamedTuple):
-    """Differences of the macro between ranked rows, row - column, and their standard errors [s]."""
+    """Differences between ranked rows, row - column, and their standard errors: of the macro [s], of success [1]."""
 
     names: tuple[str, ...]
     difference: np.ndarray  # (n, n)
@@ -43,7 +43,7 @@ class Board(NamedTuple):
 
     def row(self, name: str) -> dict:
         """The row of that name; KeyError where there is none."""
-        return next((row for row in self.rows if row["name"] == name), None) or _missing(name)
+        return row_of(self.rows, name)
 
     def table(self) -> str:
         """The board as text: one line a row, the reference rows last."""
@@ -51,15 +51,15 @@ class Board(NamedTuple):
         lines = [self._title(), head]
         for row in self.rows:
             rank = f"{row['rank']}{'=' if row['tied'] else ''}" if row["rank"] else "-"
-            units = " ".join(_cell(row["units"].get(unit), 6, 1) for unit in worlds.UNITS)
-            rates = " ".join(_cell(r[0], 9, 3) for r in row["rate"].values()) or f"{'':19}"
+            units = " ".join(fixed(row["units"].get(unit), 6, 1) for unit in worlds.UNITS)
+            rates = " ".join(fixed(r[0], 9, 3) for r in row["rate"].values()) or f"{'':19}"
             worst = row["robustness"]
-            robust = f"{_cell(worst.get('rate'), 6, 1)} {worst.get('world', '')[5:][:15]:15}" if worst else f"{'':22}"
-            macro = f"{_cell(row['macro'], 6, 2)} +-{_cell(row['macro_se'], 5, 2)}"
+            robust = f"{fixed(worst.get('rate'), 6, 1)} {worst.get('world', '')[5:][:15]:15}" if worst else f"{'':22}"
+            macro = f"{fixed(row['macro'], 6, 2)} +-{fixed(row['macro_se'], 5, 2)}"
             lines.append(
-                f"{rank:3} {row['name']:12} {macro:>13} {units} {_cell(row['p10'], 6, 1)} {_cell(row['p60'], 6, 1)} {rates:>19} "
-                f"{robust:22} {_cell(row['isolation'].get('at_alarm'), 9, 2)} {_cell(row['held_out'], 8, 1)} "
-                f"{_cell(row['nanoseconds'], 6, 0)}  {', '.join(row['notes'])}".rstrip()
+                f"{rank:3} {row['name']:12} {macro:>13} {units} {fixed(row['p10'], 6, 1)} {fixed(row['p60'], 6, 1)} {rates:>19} "
+                f"{robust:22} {fixed(row['isolation'].get('at_alarm'), 9, 2)} {fixed(row['held_out'], 8, 1)} "
+                f"{fixed(row['nanoseconds'], 6, 0)}  {', '.join(row['notes'])}".rstrip()
             )
         return "\n".join(lines)
 
@@ -110,19 +110,37 @@ class Board(NamedTuple):
 
     def to_json(self, path) -> None:
         """Write the board, sorted keys."""
-        text = json.dumps(plain(self._asdict()), indent=1, sort_keys=True, allow_nan=False)
-        check.place("path", path).write_text(text + "\n")
+        stored(self, path)
 
     @classmethod
     def from_json(cls, path) -> Board:
         """The board of a file; ValueError for what is none."""
-        found = json.loads(check.place("path", path).read_text())
-        if not isinstance(found, dict) or not set(cls._fields) <= set(found):
-            check.refuse("path", f"hold a board, with {', '.join(cls._fields)}", check.short(found))
-        return cls(*(found[name] for name in cls._fields))
+        return cls(*opened(cls._fields, path))
 
 
-def differences(a: Board, b: Board) -> list[str]:
+def stored(board: Any, path) -> None:
+    """Write a board as JSON, sorted keys."""
+    text = json.dumps(plain(board._asdict()), indent=1, sort_keys=True, allow_nan=False)
+    check.place("path", path).write_text(text + "\n")
+
+
+def opened(fields: tuple[str, ...], path) -> list:
+    """The fields of the board in a file; ValueError for what is none."""
+    found = json.loads(check.place("path", path).read_text())
+    if not isinstance(found, dict) or not set(fields) <= set(found):
+        check.refuse("path", f"hold a board, with {', '.join(fields)}", check.short(found))
+    return [found[name] for name in fields]
+
+
+def row_of(rows: list, name: str) -> dict:
+    """The row of that name; KeyError where there is none."""
+    found = [row for row in rows if row["name"] == name]
+    if not found:
+        raise KeyError(name)
+    return found[0]
+
+
+def differences(a: Any, b: Any) -> list[str]:
     """Where two boards differ beyond machine and time, as lines; none for a board that was rebuilt to the bit."""
     found: list[str] = []
 
@@ -157,9 +175,6 @@ def plain(a) -> Any:
     return str(a) if isinstance(a, Path) else a
 
 
-def _cell(value, width: int, digits: int) -> str:
+def fixed(value, width: int, digits: int) -> str:
+    """A number so wide, with so many digits behind the point; a dash for None."""
     return f"{'-' if value is None else format(value, f'.{digits}f'):>{width}}"
-
-
-def _missing(name: str) -> dict:
-    raise KeyError(name)

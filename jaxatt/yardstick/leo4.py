@@ -92,6 +92,8 @@ class Scenario(NamedTuple):
     wheel: Annotated[Fault, "N m", (), (4,)] = Fault()
     period: Annotated[Any, "s", positive] = 1e6  # after which a fault of the gyros comes again
     on: Annotated[Any, "s", limit] = np.inf  # how long it then lasts
+    off: Annotated[Vec3, "rad", finite] = zeros()  # turn of the body from its aim at the start, about body axes
+    spin: Annotated[Vec3, "rad/s", finite] = zeros()  # its rate less the commanded one at the start
 
 
 class Telemetry(NamedTuple):
@@ -107,6 +109,20 @@ class Telemetry(NamedTuple):
     bias: Annotated[Any, "rad/s"]  # (3,) likewise, in body axes
     innovation: Annotated[Any, "rad"]  # (3,)
     mode: Annotated[Any, "1"]  # int: 0 hold, 1 slew
+
+
+class Reading(NamedTuple):
+    """What a law gets at 10 Hz, after the gyros are read and, at a packet's first tick, the MEKF is updated."""
+
+    gyro: Annotated[Any, "rad/s"]  # (4,) readings
+    star: Annotated[Any, "1"]  # (4,) last quaternion of the star tracker
+    star_valid: Annotated[Any, "1"]  # bool: it was read at this tick, each fifth
+    attitude: Annotated[Any, "1"]  # (4,) of the MEKF
+    rate: Annotated[Any, "rad/s"]  # (3,) of the body, the gyros' less the MEKF's bias
+    aim: Annotated[Any, "1"]  # (4,) commanded attitude
+    aim_rate: Annotated[Any, "rad/s"]  # (3,)
+    aim_acceleration: Annotated[Any, "rad/s^2"]  # (3,)
+    torque: Annotated[Any, "N m"]  # (4,) command of the wheels until now, after the limit; 0 at the start
 
 
 class Aim(NamedTuple):
@@ -226,9 +242,20 @@ def tracking_law(params: Params, aim: Aim, q: Quat, w: Vec3) -> Vec3:
     return params.J @ (aim.a - params.kp * turn - params.kd * (w - aim.w)) + cross(w, params.J @ w)
 
 
-def shared_out(params: Params, u: Vec3):
-    """Torques (4,) [N m] of the wheels that give u [N m], limited each."""
-    return jnp.clip(0.75 * along(u), -params.torque_max, params.torque_max)
+def demanded(params: Params, reading: Reading) -> Vec3:
+    """u of the `tracking_law` [N m] for a reading."""
+    aim = Aim(Quat.of(reading.aim), Vec3.of(reading.aim_rate), Vec3.of(reading.aim_acceleration))
+    return tracking_law(params, aim, Quat.of(reading.attitude), Vec3.of(reading.rate))
+
+
+def shared_out(u: Vec3):
+    """W+ u, (4,) [N m]: the least torques of the wheels that give u [N m]."""
+    return 0.75 * along(u)
+
+
+def decide(params: Params, z, reading: Reading):
+    """z and the torques (4,) [N m] of the wheels; a controller replaces it."""
+    return z, shared_out(demanded(params, reading))
 
 
 def predicted(params: Params, computer: Computer, w: Vec3, u: Vec3) -> Computer:
@@ -270,14 +297,31 @@ def true_torque(scenario: Scenario, t, command) -> Vec3:
 def init(params: Params, scenario: Scenario):
     """x, z at the start: on the aim without an error, the filter in its stationary law by the scenario's errors."""
     aim = aim_at(scenario, 0.0)
-    four = scenario.bias
-    q = aim.q * small_turn(-scenario.turn)
-    truth = Truth(aim.q, aim.w, four, jnp.zeros_like(four), aim.q)
-    return (), Z(truth, Computer(q, rate_of(four) - scenario.bias_error))
+    four, q = scenario.bias, aim.q * small_turn(scenario.off)
+    truth = Truth(q, aim.w + scenario.spin, four, jnp.zeros_like(four), q)
+    computer = Computer(q * small_turn(-scenario.turn), rate_of(four) - scenario.bias_error)
+    return (), Z(truth, computer)
 
 
 def tick(params: Params, scenario: Scenario, now, x, z: Z, noise):
-    """One packet: star tracker and update, then five times gyros, law, plant."""
+    """One packet under the law of the world."""
+    law = lambda memory, reading: decide(params, memory, reading)
+    z, _, log = packet(params, scenario, now, z, noise, law, (), jnp.zeros_like(scenario.bias))
+    return x, z, log
+
+
+def packet(params: Params, scenario: Scenario, now, z: Z, noise, law, memory, torque):
+    """One packet: star tracker and update, then five times gyros, law, plant.
+
+    Args:
+        params, scenario, now, z, noise: as of `tick`.
+        law: (memory, reading) -> memory, command (4,) [N m] of the wheels, which the plant limits.
+        memory: of the law.
+        torque: (4,) [N m] limited command of the tick before.
+
+    Returns:
+        z, memory, and the log, whose telemetry holds the limited commands.
+    """
     noise = jnp.stack(
         [noise[NORMALS * i : NORMALS * (i + 1)] for i in range(TICKS)]
     )  # not reshaped: a batch lies behind
@@ -289,24 +333,31 @@ def tick(params: Params, scenario: Scenario, now, x, z: Z, noise):
     computer, nu = updated(params, computer, truth.star)
 
     def one(state, told):
-        truth, computer = state
-        t, noise = told
+        truth, computer, memory, torque = state
+        t, noise, first = told
         truth = gyros_read(scenario, t, truth, noise)
         aim, w = aim_at(scenario, t), rate_of(truth.gyro) - computer.b
-        command = shared_out(params, tracking_law(params, aim, computer.q, w))
+        reading = Reading(
+            truth.gyro, array(truth.star), first, array(computer.q), array(w), array(aim.q), array(aim.w), array(aim.a),
+            torque,
+        )  # fmt: skip
+        memory, command = law(memory, reading)
+        command = jnp.clip(command, -params.torque_max, params.torque_max)
         pointing = norm(vector_part(quat_conjugate(aim.q) * truth.q))
         computer = predicted(params, computer, w, summed(command))
         truth = moved(params, scenario, t, truth, true_torque(scenario, t, command))
-        return match_state((truth, computer), state, "tick"), (truth.gyro, command, pointing)
+        return match_state((truth, computer, memory, command), state, "tick"), (truth.gyro, command, pointing)
 
     ticks = time_of(TICKS * now.k + jnp.arange(TICKS, dtype=jnp.int32), DT, jnp.result_type(now.t))
-    (truth, computer), (gyro, torque, pointing) = jax.lax.scan(one, (truth, computer), (ticks, noise))
+    first = np.arange(TICKS) == 0  # the same for all scenarios, so that a `jax.lax.cond` on it takes one branch
+    begun = truth, computer, memory, torque
+    (truth, computer, memory, _), (gyro, torque, pointing) = jax.lax.scan(one, begun, (ticks, noise, first))
     telemetry = Telemetry(
         gyro, torque, array(truth.star), jnp.asarray(True), array(aim.q), array(aim.w), array(before.q),
         array(before.b), array(nu), (scenario.mode > 0).astype(jnp.int32),
     )  # fmt: skip
     off = vector_part(quat_conjugate(before.q) * start.q)
-    return x, Z(truth, computer), Log(now.t, telemetry, pointing, start.q, start.w, off)
+    return Z(truth, computer), memory, Log(now.t, telemetry, pointing, start.q, start.w, off)
 
 
 def flow(params: Params, scenario: Scenario, t, x, z: Z):

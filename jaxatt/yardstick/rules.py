@@ -8,9 +8,9 @@ from __future__ import annotations
 import hashlib
 import re
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -48,7 +48,7 @@ def example(batch: tuple = ()) -> Telemetry:
     )  # fmt: skip
 
 
-def state_of(detector: Detector):
+def state_of(detector: Any):
     """z at the start, floats in float32 as in a run."""
     short = lambda a: a.astype(jnp.float32) if jnp.issubdtype(a.dtype, jnp.floating) else a
     return jax.tree.map(lambda a: short(jnp.asarray(a)), detector.init(detector.params))
@@ -130,16 +130,19 @@ def _odd(whole: Telemetry) -> Telemetry:
     return whole._replace(star_valid=star, gyro=blank(whole.gyro, 1), torque=limit.astype(np.float32))
 
 
-def pure(detector: Detector) -> bool:
-    """Whether init and step are free of callbacks, effects and axes of the machine."""
-    programs = _programs(detector)
+def pure(detector: Any, record: Any = None) -> bool:
+    """Whether init and step are free of callbacks, effects and axes of the machine.
+
+    record: what a step gets beside params and z; None for telemetry of zeros, which a detector gets.
+    """
+    programs = _programs(detector, record)
     names = {name for program in programs for name in _primitives(program.jaxpr)}
     return not any(program.effects for program in programs) and not any(word in name for name in names for word in FORBIDDEN)  # fmt: skip
 
 
-def _programs(detector: Detector):
-    z = state_of(detector)
-    return jax.make_jaxpr(detector.init)(detector.params), jax.make_jaxpr(detector.step)(detector.params, z, example())
+def _programs(detector, record):
+    z, record = state_of(detector), example() if record is None else record
+    return jax.make_jaxpr(detector.init)(detector.params), jax.make_jaxpr(detector.step)(detector.params, z, record)
 
 
 def _primitives(jaxpr):
@@ -154,10 +157,13 @@ def _primitives(jaxpr):
                 yield from _primitives(inner)
 
 
-def digest(detector: Detector) -> str:
-    """Hash of what a detector computes: programs of init and step without addresses, their constants, and the params."""
+def digest(detector: Any, record: Any = None) -> str:
+    """Hash of what a detector computes: programs of init and step without addresses, their constants, and the params.
+
+    record: as of `pure`.
+    """
     found = hashlib.sha256()
-    for program in _programs(detector):
+    for program in _programs(detector, record):
         found.update(re.sub(r"0x[0-9a-f]+", "", str(program)).encode())
         for a in program.consts:
             found.update(np.asarray(a).tobytes())
@@ -166,11 +172,13 @@ def digest(detector: Detector) -> str:
     return found.hexdigest()
 
 
-def seed_of(world: worlds.World, detectors: Sequence[Detector], board: str) -> int:
-    """The test key's seed, 64 bits of a hash of the board, the world and all detectors: who adds a row draws fresh days."""
-    text = "".join(
-        [board, world.name, world.version, *(d.name + digest(d) for d in sorted(detectors, key=lambda d: d.name))]
-    )
+def seed_of(world: worlds.World, detectors: Sequence[Any], board: str, record: Any = None) -> int:
+    """The test key's seed, 64 bits of a hash of the board, the world and all detectors: who adds a row draws fresh days.
+
+    record: as of `pure`.
+    """
+    order = sorted(detectors, key=lambda d: d.name)
+    text = "".join([board, world.name, world.version, *(d.name + digest(d, record) for d in order)])
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big")
 
 
@@ -181,32 +189,45 @@ def key_of(seed: int):
 
 def validated(detectors: Sequence[Detector]) -> tuple[Detector, ...]:
     """The detectors, if they are some, of different names, and each gives a score and a blame of the right shape."""
-    detectors = tuple(detectors) if isinstance(detectors, Sequence) else ()
-    if not detectors:
-        check.refuse("detectors", "hold at least one Detector", "empty")
+    return named("detectors", detectors, Detector, _shapes)
+
+
+def named(name: str, entries: Sequence[Any], kind: type, shapes: Callable) -> tuple:
+    """The entries of a board, a sequence of ``kind`` called ``name``, if they are some, of different names and shapes(entry) raises nothing."""
+    entries = tuple(entries) if isinstance(entries, Sequence) else ()
+    if not entries:
+        check.refuse(name, f"hold at least one {kind.__name__}", "empty")
     names = []
-    for i, d in enumerate(detectors):
-        check.kind(f"detectors[{i}]", d, Detector)
+    for i, d in enumerate(entries):
+        check.kind(f"{name}[{i}]", d, kind)
         if d.name in names:
-            check.refuse("detectors", "have names that differ", f"{d.name!r} twice")
+            check.refuse(name, "have names that differ", f"{d.name!r} twice")
         names.append(d.name)
-        _shapes(d)
-    return detectors
+        shapes(d)
+    return entries
 
 
-def _shapes(d: Detector) -> None:
-    """Raise where a step does not give back the structure of z, and a score () and a blame (11,)."""
+def stepped(d: Any, record: Any, told: str):
+    """Shapes of what a step gives beside z; raises TypeError where it does not give z, ``told``, with z as it got it."""
     z = state_of(d)
-    out = jax.eval_shape(d.step, d.params, z, example())
-    if not (isinstance(out, tuple) and len(out) == 2 and hasattr(out[1], "score") and hasattr(out[1], "blame")):
-        raise TypeError(f"`{d.name}.step` must return z, Verdict, but it is {check.short(out)}.")
-    after, verdict = out
+    out = jax.eval_shape(d.step, d.params, z, record)
+    if not (isinstance(out, tuple) and len(out) == 2):
+        raise TypeError(f"`{d.name}.step` must return z, {told}, but it is {check.short(out)}.")
+    after, found = out
     if jax.tree.structure(after) != jax.tree.structure(z):
         raise TypeError(f"`{d.name}.step` must return z as it got it, but it is {jax.tree.structure(after)}.")
     for path, a in jax.tree_util.tree_leaves_with_path(after):
         b = dict(jax.tree_util.tree_leaves_with_path(z))[path]
         if np.shape(a) != np.shape(b):
             raise TypeError(f"`{d.name}.step` must return z{jax.tree_util.keystr(path)} of shape {np.shape(b)}, but it is {np.shape(a)}.")  # fmt: skip
+    return found
+
+
+def _shapes(d: Detector) -> None:
+    """Raise where a step does not give back the structure of z, and a score () and a blame (11,)."""
+    verdict = stepped(d, example(), "Verdict")
+    if not (hasattr(verdict, "score") and hasattr(verdict, "blame")):
+        raise TypeError(f"`{d.name}.step` must return z, Verdict, but it is {check.short(verdict)}.")
     for name, shape in (("score", ()), ("blame", (11,))):
         if getattr(verdict, name).shape != shape:
             raise TypeError(f"`{d.name}.step` must return a {name} of shape {shape}, but it is {getattr(verdict, name).shape}.")  # fmt: skip

@@ -233,14 +233,21 @@ def days(world: World, key, numbers, cells) -> Any:
     cells: one cell, or `effects` of shape (n,).
     """
     numbers = np.asarray(numbers, np.int32)
-    wide = lambda a: np.resize(np.broadcast_to(np.asarray(a, np.float32), numbers.shape), full)
-    full = -(-len(numbers) // DRAWN) * DRAWN
-    both, places = jax.tree.map(wide, effects(cells)), np.resize(numbers, full)
-    sample, of_world = (
-        (world.sample.func, world.sample.args) if isinstance(world.sample, partial) else (world.sample, ())
-    )
+    return drawn(world.sample, key, numbers, jax.tree.map(lambda a: np.broadcast_to(a, numbers.shape), effects(cells)))
+
+
+def drawn(sample: Callable, key, numbers, cells) -> Any:
+    """sample(key, number, cell) of all numbers, float32 NumPy arrays with n in front.
+
+    sample: a function, or a partial whose arguments are numbers and may differ without a new program; cells: a tree of
+    arrays with n in front.
+    """
+    numbers, full = np.asarray(numbers, np.int32), -(-len(numbers) // DRAWN) * DRAWN
+    wide = lambda a: np.resize(np.asarray(a, np.float32), (full, *np.shape(a)[1:]))
+    cells, places = jax.tree.map(wide, cells), np.resize(numbers, full)
+    function, of_world = (sample.func, sample.args) if isinstance(sample, partial) else (sample, ())
     parts = [
-        _many(sample)(of_world, key, places[i : i + DRAWN], jax.tree.map(lambda a, i=i: a[i : i + DRAWN], both))
+        _many(function)(of_world, key, places[i : i + DRAWN], jax.tree.map(lambda a, i=i: a[i : i + DRAWN], cells))
         for i in range(0, full, DRAWN)
     ]
     return jax.tree.map(lambda *a: np.concatenate(a)[: len(numbers)], *parts)
