@@ -38,7 +38,7 @@ EXPERIMENTS = {
     "wheel_mrac": Experiment(30, 77, "loss_of_effectiveness"),
     "microsat": Experiment(90, 50, "reconfiguration"),
     "rare_events": Experiment(45, 16, "curves"),
-    "yardstick": Experiment(110, 38, "board"),
+    "yardstick": Experiment(140, 42, "board"),
 }
 NAMES = tuple(EXPERIMENTS)
 LOOPS = tuple(name for name in NAMES if find_spec(f"jaxatt.loops.{name}"))  # which have studies and a campaign

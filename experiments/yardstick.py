@@ -1,7 +1,8 @@
 """The yardstick: its world, its thresholds and its board against an independent reference of the same text.
 
 Tolerances are three standard errors of both sides: the reference took 24 000 windows to calibrate, 16 384 to validate and 320
-days a cell. Quick: a thousand windows, four rows and twelve cells; the same checks where they can be made.
+days a cell. Quick: a thousand windows, four rows and twelve cells; the same checks where they can be made. Controllers:
+`yardstick_control`.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
+from experiments import yardstick_control
 from jaxatt import simulate, soft_scores
 from jaxatt.yardstick import NAMES, bank, baselines, leo4, metrics, oracle, rank, telemetry, tune, worlds
 from jaxatt.yardstick.board import differences
@@ -83,6 +85,7 @@ def run(report) -> None:
     bounds(report)
     white_noise(report)
     board(report)
+    yardstick_control.run(report)
     if not report.quick:
         tuned_cusum(report)
         cross_check(report)

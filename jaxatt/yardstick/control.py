@@ -106,7 +106,7 @@ def _episode(name, spread: worlds.Spread, key, index, faults: tuple[Cell, Any]) 
     role = jnp.argsort(jnp.argsort(place))
     cell = jax.tree.map(lambda a: a[role] if a.shape == (4,) else a, cell)
     between = lambda low, high, u: low + (high - low) * _share(u, deciles)
-    error, onset = between(*ERROR, start[0]), between(*cell.onset, start[1])
+    error, onset = between(*ERROR, start[0]), between(cell.onset[0], cell.onset[1], start[1])
     wheel = jax.tree.map(lambda a: jnp.broadcast_to(a, 4), Fault())._replace(
         onset=jnp.broadcast_to(onset, 4),
         scale=between(cell.low, cell.high, gain) * jnp.where(flip < cell.flipped, -1, 1),
@@ -382,7 +382,8 @@ def board_parts(ranked: Sequence[Controller], found: dict[str, dict[str, Outcome
 def summary(found: Outcome) -> dict:
     """Success with its 95 % interval, quantiles of settling time and peak over all episodes, how many were lost."""
     n, wins = len(found.success), int(np.sum(found.success))
-    of = lambda values: [float(np.quantile(np.nan_to_num(values, nan=np.inf), q, method="inverted_cdf")) for q in (0.5, 0.95)]  # fmt: skip
+    known = lambda values: np.where(np.isnan(values), np.inf, values)
+    of = lambda values: [float(np.quantile(known(values), q, method="inverted_cdf")) for q in (0.5, 0.95)]
     return {
         "success": [wins / n, *wilson(wins, n)], "settling": of(found.settled), "peak": of(np.rad2deg(found.peak)),
         "lost": int(found.lost.sum()),

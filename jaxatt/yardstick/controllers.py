@@ -66,8 +66,8 @@ class Adaptive(NamedTuple):
     """Rates of the adaptive law."""
 
     law: leo4.Params = leo4.params
-    gain_rate: Annotated[Any, "1/(N m rad)", not_negative] = 300.0  # gamma_rho
-    bias_rate: Annotated[Any, "N m/rad", not_negative] = 0.05  # gamma_eta
+    gain_rate: Annotated[Any, "1/(N m rad)", not_negative] = 1e4  # gamma_rho
+    bias_rate: Annotated[Any, "N m/rad", not_negative] = 1.5  # gamma_eta
     low: Annotated[Any, "1", positive] = 0.2  # where rho is kept
     high: Annotated[Any, "1", positive] = 10.0
 
