@@ -1,6 +1,7 @@
 """The control track of the yardstick: its laws against closed forms, its draws, its gate, its board and its refusals."""
 
 import importlib
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -52,7 +53,7 @@ SYSTEM = driven(mine_init, mine_step)
 QUIET = jnp.zeros((PACKETS, leo4.system.normals))
 
 
-def alone(scenarios, i=0, kind=float):
+def alone(scenarios, i=0, kind: Any = float):
     return jax.tree.map(lambda a: np.asarray(a[i], kind), scenarios)
 
 
@@ -81,7 +82,7 @@ def test_a_bias_leaves_pd_at_its_closed_form_and_an_integral_takes_it_away():
     Less at most kd DT / 2 = .9 %: the MEKF, which expects no such acceleration, takes half a tick of it for a bias.
     """
     day = alone(episodes(CELLS["none"], KEY, np.arange(1)), kind=np.float32)
-    day = day._replace(wheel=day.wheel._replace(bias=np.float32([0.0, 4e-3, 0.0, 0.0])))
+    day = day._replace(wheel=day.wheel._replace(bias=np.array([0.0, 4e-3, 0.0, 0.0], np.float32)))
     still = {name: jax.tree.map(lambda a: 0 * a, getattr(day, name)) for name in ("bias", "scale", "constant", "turn", "bias_error")}  # fmt: skip
     day, found = day._replace(stretch=Vec3(*np.ones(3, np.float32)), **still), {}
     for ki in (0.0, 2e-4):
@@ -305,17 +306,18 @@ def test_the_door_refuses_what_cannot_be_ranked():
         jax.debug.callback(lambda a: None, reading.rate)
         return mine_step(params, z, reading)
 
-    detector = worlds.WORLDS["leo4"]._replace(system=leo4.system._replace(dt=1.0), name="other")
-    for arguments, how, said in (
+    other = worlds.WORLDS["leo4"]._replace(system=leo4.system._replace(dt=1.0), name="other")
+    refused: list[tuple[tuple, dict, str]] = [
         (([],), {}, "`controllers` must hold at least one Controller, but it is empty"),
         (([MINE, MINE],), {}, "have names that differ, but it is 'mine' twice"),
         (([MINE],), {"n": 1}, "`n` must"),
         (([MINE],), {"deciles": "some"}, "`deciles` must be one of odd, even, all, but it is 'some'"),
-        (([MINE], detector), {}, "`world` must be a world of leo4's, but it is other"),
+        (([MINE], other), {}, "`world` must be a world of leo4's, but it is other"),
         (([MINE._replace(step=told)],), {}, "be free of callbacks"),
-    ):
+    ]
+    for arguments, how, said in refused:
         with pytest.raises(ValueError, match=said):
             control(*arguments, **how)
     with pytest.raises(TypeError, match=r"`controllers\[0\]` must"):
-        control([mine_step])
+        control([mine_step])  # pyright: ignore[reportArgumentType]
     assert all(rules.pure(c, example()) for c in CONTROLLERS.values())

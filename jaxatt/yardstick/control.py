@@ -256,22 +256,22 @@ class ControlBoard(NamedTuple):
         """The board as text: success in % by cell with the half width of Wilson's interval, then `wild` in detail."""
         h, names = self.header, list(self.cells)
         lines = [f"yardstick {h['board']}, controllers in {h['world']}, {h['n']} episodes a cell, {h['deciles']} deciles, test key {h['seed'] or 'given'}"]  # fmt: skip
-        lines.append(f"{'':3} {'row':12} success %  " + " ".join(f"{name:>10}" for name in names))
+        lines.append(f"{'':3} {'row':12} success %  " + " ".join(f"{name:>12}" for name in names))
         ranked = [(f"{row['rank']}{'=' if row['tied'] else ''}", row["name"]) for row in self.rows]
         for rank, name in ranked:
             found = [self.cells[c][name]["success"] for c in names]
             each = [f"{100 * p:5.1f} +-{50 * (high - low):3.1f}" for p, low, high in found]
-            lines.append(f"{rank:3} {name:23} " + " ".join(f"{text:>10}" for text in each))
+            lines.append(f"{rank:3} {name:23} " + " ".join(f"{text:>12}" for text in each))
         lines.append(f"{'':3} {'row':12} settling s, median / 95 % of all episodes; - is never")
         for rank, name in ranked:
             found = [self.cells[c][name]["settling"] for c in names]
             each = [f"{fixed(a, 0, 0)} / {fixed(b, 0, 0)}" for a, b in found]
-            lines.append(f"{rank:3} {name:23} " + " ".join(f"{text:>10}" for text in each))
+            lines.append(f"{rank:3} {name:23} " + " ".join(f"{text:>12}" for text in each))
         lines.append(f"{'':3} {'row':12} largest pointing error from the onset deg, median / 95 %")
         for rank, name in ranked:
             found = [self.cells[c][name]["peak"] for c in names]
             each = [f"{fixed(a, 0, 1)} / {fixed(b, 0, 1)}" for a, b in found]
-            lines.append(f"{rank:3} {name:23} " + " ".join(f"{text:>10}" for text in each))
+            lines.append(f"{rank:3} {name:23} " + " ".join(f"{text:>12}" for text in each))
         notes = [f"{row['name']}: {row['lost']} episodes lost by a command that is no number" for row in self.rows if row["lost"]]  # fmt: skip
         return "\n".join([*lines, *notes])
 
