@@ -136,3 +136,13 @@ def test_rare_events(monkeypatch):
     angle_noise = np.nanmean(names["rows"][:, 1], axis=0)
     assert angle_noise[30:60].mean() < -0.5 and abs(angle_noise).max() < 2  # a long lean to one side, no large sample
     assert names["tuned"].high < loss.low
+
+
+def test_yardstick(monkeypatch):
+    names = executed("yardstick", monkeypatch)
+    code = [cell.source for cell in NOTEBOOKS["yardstick"].cells if cell.cell_type == "code"]
+    assert sum(bool(line.strip()) for part in code[:3] for line in part.splitlines()) <= 40 and "rank(" in code[2]
+    ewma, other = (names["board"].row(name) for name in ("ewma", "chi2_10"))
+    assert (ewma["rank"], other["rank"]) == (1, 2) and ewma["macro"] < 5 and ewma["notes"] == []
+    success = names["ranked"].row("observer")["success"]
+    assert success["bias"] == success["none"] == 1 and success["sign"] < 0.1

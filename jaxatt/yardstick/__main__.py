@@ -1,8 +1,8 @@
 """Rebuild a board from its file and compare: ``python -m jaxatt.yardstick board.json``.
 
-The rows must be baselines. Says where the new board differs, and returns 1 if it does.
+Of detectors or of controllers; the rows must be baselines. Says where the new board differs, and returns 1 if it does.
 
-May import: board, fitting, ranking, worlds, compiling.
+May import: board, control, controllers, fitting, ranking, worlds, compiling.
 """
 
 from __future__ import annotations
@@ -13,6 +13,8 @@ from pathlib import Path
 
 from jaxatt.compiling import configure
 from jaxatt.yardstick.board import Board, differences
+from jaxatt.yardstick.control import ControlBoard, control
+from jaxatt.yardstick.controllers import CONTROLLERS
 from jaxatt.yardstick.fitting import NAMES, tune
 from jaxatt.yardstick.ranking import rank
 from jaxatt.yardstick.worlds import WORLDS
@@ -26,14 +28,23 @@ def main(arguments: list[str] | None = None) -> int:
     configure()
     before = Board.from_json(args.board)
     h = before.header
-    unknown = [name for name in h["detectors"] if name not in NAMES]
+    driven = h.get("track") == "control"
+    known, names = (CONTROLLERS, h["controllers"]) if driven else (NAMES, h["detectors"])
+    unknown = [name for name in names if name not in known]
     if unknown or h["seed"] is None:
         parser.error(
             f"`board` must hold baselines ranked by their hash, but it is of {', '.join(unknown) or 'a key of its own'}."
         )
+    if driven:
+        rows = [CONTROLLERS[name] for name in names]
+        return told(before, control(rows, WORLDS[h["world"]], n=h["n"], deciles=h["deciles"]))
     cells = None if h["cells"] is None else [(k, tuple(s) if isinstance(s, list) else s) for k, s in h["cells"]]
     how = {"ruleset": h["ruleset"], "days": h["days"], "hours": h["hours"], "cells": cells}
-    now = rank([tune(name) for name in h["detectors"]], WORLDS[h["world"]], **how, progress=True)
+    return told(before, rank([tune(name) for name in names], WORLDS[h["world"]], **how, progress=True))
+
+
+def told(before: Board, now: Board | ControlBoard) -> int:
+    """Print the new board and where it differs; 1 if it does."""
     print(now.table())
     apart = differences(before, now)
     print("\n".join(apart[:20]) or "the same to the bit")
