@@ -196,7 +196,7 @@ def score(params: Params, scenario, now, log: leo4.Log) -> Outcome:
         settled=scores.peak(jnp.max(jnp.where(beyond, t + leo4.DT - onset, 0))),
         outside=scores.final(beyond[-1]),
         peak=scores.peak(jnp.max(jnp.where(t >= onset, angle, 0))),
-        lost=scores.always(jnp.isfinite(jnp.sum(log.telemetry.torque))),
+        lost=scores.always(jnp.isfinite(jnp.sum(log.telemetry.torque))),  # that none was lost; `run` negates it
     )
 
 
@@ -238,9 +238,7 @@ class ControlBoard(NamedTuple):
 
     header: dict  # versions, test key, episodes a cell, deciles, seconds
     rows: list  # one dict a controller, the best first
-    cells: (
-        dict  # cell -> name -> success [share, low, high], settling [median, 95 %, s], peak [median, 95 %, deg], lost
-    )
+    cells: dict  # cell -> name -> success [share, low, high], settling and peak [median, 95 %] in s and deg, lost
     matrix: dict  # names; difference and error: cell -> (n, n)
 
     def row(self, name: str) -> dict:
@@ -253,25 +251,19 @@ class ControlBoard(NamedTuple):
         return Pairs(tuple(self.matrix["names"]), *of)
 
     def table(self) -> str:
-        """The board as text: success in % by cell with the half width of Wilson's interval, then `wild` in detail."""
+        """The board as text: success with half the width of Wilson's interval, settling times, largest errors."""
         h, names = self.header, list(self.cells)
         lines = [f"yardstick {h['board']}, controllers in {h['world']}, {h['n']} episodes a cell, {h['deciles']} deciles, test key {h['seed'] or 'given'}"]  # fmt: skip
-        lines.append(f"{'':3} {'row':12} success %  " + " ".join(f"{name:>12}" for name in names))
-        ranked = [(f"{row['rank']}{'=' if row['tied'] else ''}", row["name"]) for row in self.rows]
-        for rank, name in ranked:
-            found = [self.cells[c][name]["success"] for c in names]
-            each = [f"{100 * p:5.1f} +-{50 * (high - low):3.1f}" for p, low, high in found]
-            lines.append(f"{rank:3} {name:23} " + " ".join(f"{text:>12}" for text in each))
-        lines.append(f"{'':3} {'row':12} settling s, median / 95 % of all episodes; - is never")
-        for rank, name in ranked:
-            found = [self.cells[c][name]["settling"] for c in names]
-            each = [f"{fixed(a, 0, 0)} / {fixed(b, 0, 0)}" for a, b in found]
-            lines.append(f"{rank:3} {name:23} " + " ".join(f"{text:>12}" for text in each))
-        lines.append(f"{'':3} {'row':12} largest pointing error from the onset deg, median / 95 %")
-        for rank, name in ranked:
-            found = [self.cells[c][name]["peak"] for c in names]
-            each = [f"{fixed(a, 0, 1)} / {fixed(b, 0, 1)}" for a, b in found]
-            lines.append(f"{rank:3} {name:23} " + " ".join(f"{text:>12}" for text in each))
+        for head, field, said in (
+            ("success %", "success", lambda p, low, high: f"{100 * p:.1f} +-{50 * (high - low):3.1f}"),
+            ("settling s, median / 95 % of all episodes; - is never", "settling", _two(0)),
+            ("largest pointing error from the onset deg, median / 95 %", "peak", _two(1)),
+        ):
+            lines += ["", head, f"{'':16} " + " ".join(f"{name:>13}" for name in names)]
+            for row in self.rows:
+                each = [said(*self.cells[c][row["name"]][field]) for c in names]
+                rank = f"{row['rank']}{'=' if row['tied'] else ''}"
+                lines.append(f"{rank:3} {row['name']:12} " + " ".join(f"{text:>13}" for text in each))
         notes = [f"{row['name']}: {row['lost']} episodes lost by a command that is no number" for row in self.rows if row["lost"]]  # fmt: skip
         return "\n".join([*lines, *notes])
 
@@ -304,6 +296,10 @@ class ControlBoard(NamedTuple):
     def from_json(cls, path) -> ControlBoard:
         """The board of a file; ValueError for what is none."""
         return cls(*opened(cls._fields, path))
+
+
+def _two(digits: int) -> Callable:
+    return lambda a, b: f"{fixed(a, 0, digits)} / {fixed(b, 0, digits)}"
 
 
 def control(

@@ -110,7 +110,7 @@ class Nussbaum(NamedTuple):
 
     law: leo4.Params = leo4.params
     rate: Annotated[Any, "1/(N m rad)", not_negative] = 300.0
-    start: Annotated[Any, "1", positive] = 1.88  # k, where -k^2 cos k is 1.07
+    start: Annotated[Any, "1", positive] = 1.88  # k, where -k^2 cos k is 1.08
 
 
 def nussbaum_init(params: Nussbaum):

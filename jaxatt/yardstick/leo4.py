@@ -295,7 +295,7 @@ def true_torque(scenario: Scenario, t, command) -> Vec3:
 
 
 def init(params: Params, scenario: Scenario):
-    """x, z at the start: on the aim without an error, the filter in its stationary law by the scenario's errors."""
+    """x, z at the start: off the aim as the scenario says, the filter in its stationary law by the scenario's errors."""
     aim = aim_at(scenario, 0.0)
     four, q = scenario.bias, aim.q * small_turn(scenario.off)
     truth = Truth(q, aim.w + scenario.spin, four, jnp.zeros_like(four), q)
