@@ -24,6 +24,7 @@ from jaxatt.yardstick import (
     worlds,
 )
 from jaxatt.yardstick import controllers as laws
+from jaxatt.yardstick.__main__ import main
 from jaxatt.yardstick.board import differences
 from jaxatt.yardstick.control import GATE, PACKETS, Outcome, Params, cell, example, run
 
@@ -254,7 +255,7 @@ def made_up(controller, scenarios, key, *, world):
     """Episodes of which the first controller fails one in four, the second those and as many more."""
     n = len(scenarios.mode)
     number = np.arange(n) % 8
-    success = {"one": number % 4 > 0, "two": number % 2 > 0, "nan": number < 0}[controller.name]
+    success = {"one": number % 4 > 0, "two": number % 2 > 0, "nan": number < 0}.get(controller.name, number < 4)
     settled = np.where(success, 40.0 + number, np.inf)
     return Outcome(success, settled, ~success, np.full(n, 0.1), np.full(n, controller.name == "nan"))
 
@@ -283,6 +284,15 @@ def test_a_board_says_what_the_episodes_held(monkeypatch, tmp_path):
     assert len(board.figure().axes) == 2
     other = control([*entries[:2], named("one", params=GAINS | {"kp": 0.02})], n=128)
     assert other.header["seed"] != board.header["seed"] and len(other.header["seed"]) == 16
+
+
+def test_the_command_rebuilds_a_board_of_baselines_and_says_what_differs(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(importlib.import_module("jaxatt.yardstick.control"), "run", made_up)
+    board = control([CONTROLLERS["pd"], CONTROLLERS["pid"]], n=16, deciles="all")
+    assert [row["tied"] for row in board.rows] == [True, True]
+    for spoiled, code, said in ((board, 0, "the same to the bit"), (board._replace(matrix={}), 1, "board.matrix")):
+        spoiled.to_json(tmp_path / "board.json")
+        assert main([str(tmp_path / "board.json")]) == code and said in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
