@@ -280,7 +280,7 @@ def test_a_board_says_what_the_episodes_held(monkeypatch, tmp_path):
     assert board.row("nan")["tuned"] == 2 and "1408 episodes lost" in board.table() and "75.0 +-7.4" in board.table()
     board.to_json(tmp_path / "board.json")
     again = ControlBoard.from_json(tmp_path / "board.json")
-    assert again == board and differences(again, control(entries, n=128)) == []
+    assert again == board and again.table() == board.table() and differences(again, control(entries, n=128)) == []
     assert len(board.figure().axes) == 2
     other = control([*entries[:2], named("one", params=GAINS | {"kp": 0.02})], n=128)
     assert other.header["seed"] != board.header["seed"] and len(other.header["seed"]) == 16

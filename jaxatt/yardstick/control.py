@@ -252,7 +252,7 @@ class ControlBoard(NamedTuple):
 
     def table(self) -> str:
         """The board as text: success with half the width of Wilson's interval, settling times, largest errors."""
-        h, names = self.header, list(self.cells)
+        h, names = self.header, [name for name in CELLS if name in self.cells]  # a file sorts them by name
         lines = [f"yardstick {h['board']}, controllers in {h['world']}, {h['n']} episodes a cell, {h['deciles']} deciles, test key {h['seed'] or 'given'}"]  # fmt: skip
         for head, field, said in (
             ("success %", "success", lambda p, low, high: f"{100 * p:.1f} +-{50 * (high - low):3.1f}"),
@@ -271,7 +271,7 @@ class ControlBoard(NamedTuple):
         """Success of each controller in each cell with its interval. Needs matplotlib."""
         import matplotlib.pyplot as plt
 
-        names, rows = list(self.cells), [row["name"] for row in self.rows]
+        names, rows = [name for name in CELLS if name in self.cells], [row["name"] for row in self.rows]
         found = np.array([[self.cells[c][name]["success"] for c in names] for name in rows], float)
         fig, ax = plt.subplots(figsize=(1.5 + 0.92 * len(names), 1.2 + 0.62 * len(rows)), layout="constrained")
         image = ax.imshow(100 * found[..., 0], cmap="cividis", vmin=0, vmax=100, aspect="auto")

@@ -115,7 +115,7 @@ class Nussbaum(NamedTuple):
 
 def nussbaum_init(params: Nussbaum):
     """k (3,)."""
-    return params.start * jnp.ones(3)
+    return jnp.full(3, params.start)
 
 
 def nussbaum_step(params: Nussbaum, k, reading: Reading):
@@ -154,7 +154,7 @@ class Estimated(NamedTuple):
 def structured_init(params: Structured) -> Estimated:
     """Healthy wheels, no torque."""
     gains, three = jnp.ones(4), jnp.zeros(3)
-    cov = jnp.diag(jnp.concatenate([params.gain * gains, params.torque * jnp.ones(3)]))
+    cov = jnp.diag(jnp.concatenate([jnp.full(4, params.gain), jnp.full(3, params.torque)]))
     zero = Vec3.of(three)
     return Estimated(Belief(jnp.concatenate([gains, three]), cov), 0 * gains, zero, zero, jnp.zeros(()))
 
@@ -162,11 +162,11 @@ def structured_init(params: Structured) -> Estimated:
 def wheels_seen(params: Structured, z: Estimated, rate: Vec3) -> Estimated:
     """The belief after a packet: J (w - w before) / .5 s + mean(w x J w) = W diag(mean command) g + T + noise of R."""
     mean, at = z.torque / leo4.TICKS, (params.law.J @ (rate - z.rate)) / leo4.PACKET + z.moment / leo4.TICKS
-    walk = jnp.concatenate([params.walk_gain * jnp.ones(4), params.walk_torque * jnp.ones(3)])
+    walk = jnp.concatenate([jnp.full(4, params.walk_gain), jnp.full(3, params.walk_torque)])
     cov = z.belief.cov + jnp.diag(walk.astype(z.belief.cov.dtype))
     expected = lambda x: leo4.summed(mean * x[:4]) + Vec3.of(x[4:])
     reading = Measured(array(at), jnp.broadcast_to(z.seen > 0, 3))
-    belief, _ = filters.update(Belief(z.belief.mean, cov), reading, expected, params.R * jnp.ones(3))
+    belief, _ = filters.update(Belief(z.belief.mean, cov), reading, expected, jnp.full(3, params.R))
     zero = Vec3(*(0 * a for a in rate))
     return Estimated(belief, 0 * z.torque, zero, rate, jnp.ones_like(z.seen))
 
