@@ -328,6 +328,8 @@ def test_the_door_refuses_what_cannot_be_ranked():
     for arguments, how, said in refused:
         with pytest.raises(ValueError, match=said):
             control(*arguments, **how)
+    with pytest.raises((TypeError, ValueError), match="`key` must"):
+        control([MINE], key=3.5)
     with pytest.raises(TypeError, match=r"`controllers\[0\]` must"):
         control([mine_step])  # pyright: ignore[reportArgumentType]
     assert all(rules.pure(c, example()) for c in CONTROLLERS.values())

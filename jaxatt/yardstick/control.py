@@ -5,7 +5,7 @@ Plant, sensors and MEKF are those of `leo4`, of which a controller replaces `dec
 pointing error is at most .2 deg at every tick of the last 30 s. Episode i has the same body, start, noise and order of wheels
 in every cell and for every controller, so all comparisons are paired.
 
-May import: leo4, board, metrics, rules, worlds, check, contract, faults, loss, scores, sweeping, vec.
+May import: leo4, board, calibration, metrics, rules, worlds, check, contract, faults, loss, scores, sweeping, vec.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from jaxatt.sweeping import progress_bar, sweep
 from jaxatt.vec import Vec3, zeros
 from jaxatt.yardstick import leo4, metrics, rules, worlds
 from jaxatt.yardstick.board import Pairs, fixed, opened, plain, row_of, stored
+from jaxatt.yardstick.calibration import typed
 from jaxatt.yardstick.leo4 import Reading
 from jaxatt.yardstick.worlds import WORLDS, World
 
@@ -135,7 +136,7 @@ def episodes(cell: Cell, key, numbers, *, world: World = WORLDS["leo4"], deciles
     Example:
         >>> train = episodes(CELLS["wild"], jax.random.key(0), np.arange(1024), deciles="even")
     """
-    if deciles not in DECILES:
+    if not isinstance(deciles, str) or deciles not in DECILES:
         check.refuse("deciles", f"be one of {', '.join(DECILES)}", check.short(deciles))
     wide = lambda a: np.broadcast_to(a, (len(numbers), *np.shape(a)))
     faults = jax.tree.map(wide, (cell, float(DECILES.index(deciles))))
@@ -335,6 +336,7 @@ def control(
     for c in ranked:
         if not rules.pure(c, example()):
             check.refuse(f"controllers, {c.name},", "be free of callbacks and other effects", "not")
+    key = None if key is None else typed(key)
     seed = rules.seed_of(world, ranked, VERSION, example()) if key is None else None
     key = rules.key_of(seed) if seed is not None else key
 
