@@ -26,27 +26,9 @@ from jaxatt.stamps import JOINED, STAMPS, reader, zone_of
 TEXT = (".csv", ".txt", ".tsv", ".dat", ".log", ".asc")
 COMMENTS = ("#", "%", "//")  # what lines that are no rows begin with
 FLAGS = {"true": 1.0, "false": 0.0}
-MISSING = frozenset(
-    (
-        "",
-        "nan",
-        "na",
-        "n/a",
-        "#n/a",
-        "#na",
-        "<na>",
-        "null",
-        "none",
-        "-",
-        "--",
-        "---",
-        "-nan",
-        "nan(ind)",
-        "-nan(ind)",
-        "1.#qnan",
-        "-1.#ind",
-    )
-)
+MISSING = frozenset((
+    "", "nan", "na", "n/a", "#n/a", "#na", "<na>", "null", "none", "-", "--", "---", "-nan", "nan(ind)", "-nan(ind)", "1.#qnan", "-1.#ind",
+))  # fmt: skip
 # the last word of a column that says which instrument a row is of
 INSTRUMENTS = {
     "id", "sensor", "sensorid", "sensor_id", "instrument", "device", "deviceid", "device_id", "imu", "imuid", "imu_id", "source", "channel",

@@ -89,11 +89,7 @@ def _parsed(text: str) -> tuple[float, frozenset] | None:
     tokens = re.findall(
         r"per\b|[A-Za-z%]+|\^?[+-]?\d+(?:\.\d+)?|[/()\-]|\S", re.sub(r"(?<=[A-Za-z])-(?=[A-Za-z])", " ", text)
     )
-    sign, depth, last = (
-        1,
-        [1],
-        None,
-    )  # sign of the powers to come; that of the brackets around; the unit to which a power belongs
+    sign, depth, last = 1, [1], None  # of the powers to come; of the brackets around; unit to which a power belongs
     for token in tokens:
         if token in ("/", "per"):
             sign, last = -1, None

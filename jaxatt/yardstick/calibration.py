@@ -72,6 +72,20 @@ def threshold_slope(maxima, slopes, threshold: float, share: float = NEAREST) ->
     return slopes[near].mean(0), slopes[near].std(0, ddof=1) / np.sqrt(len(near))
 
 
+def threshold_slopes(peaks, moved, thresholds) -> tuple[np.ndarray, np.ndarray]:
+    """`threshold_slope` of all detectors and modes, (detectors, modes, k) each.
+
+    peaks: (n, detectors), modes in turn; moved: (n, detectors, k + modes), by the numbers and then by the thresholds.
+    """
+    modes = np.shape(thresholds)[1]
+    each = [
+        [threshold_slope(peaks[m::modes, d], moved[m::modes, d, :-modes], h) for m, h in enumerate(row)]
+        for d, row in enumerate(thresholds)
+    ]
+    slope, error = np.moveaxis(np.array(each), 2, 0)
+    return slope, error
+
+
 def rate_of(k, n) -> tuple[Any, Any, Any]:
     """Alarms per hour and their 95 % interval from k of n windows with an alarm: -ln(1 - k / n) / T."""
     with np.errstate(divide="ignore"):
@@ -138,9 +152,7 @@ def calibrate(
         return found
     days = worlds.days(world, jax.random.fold_in(key, 1), np.arange(n), None)
     softly, moved = slopes(world, detectors, jax.random.fold_in(key, 1), days, *gradient)
-    each = [[threshold_slope(softly.peak[m::modes, d], moved.peak[m::modes, d, :-modes], h) for m, h in enumerate(row)]
-            for d, row in enumerate(found.threshold)]  # fmt: skip
-    slope, error = np.moveaxis(np.array(each), 2, 0)
+    slope, error = threshold_slopes(softly.peak, moved.peak, found.threshold)
     return found._replace(slope=slope, slope_error=error)
 
 

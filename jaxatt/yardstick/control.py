@@ -219,16 +219,10 @@ def run(controller: Controller, scenarios: leo4.Scenario, key, *, world: World =
         >>> found.success.mean()
     """
     system = driven(controller.init, controller.step)
-    params = jax.tree.map(_short, Params(world.params, controller.params))
+    params = jax.tree.map(worlds.short, Params(world.params, controller.params))
     with np.errstate(all="ignore"):
         found = sweep(system, params, scenarios, key, ticks=PACKETS, score=score, progress=False)
     return found._replace(settled=np.where(found.outside, np.inf, found.settled), lost=~found.lost)
-
-
-def _short(a):
-    """A number in float32, the type of all runs of the yardstick."""
-    a = np.asarray(a)
-    return a.astype(np.float32) if a.dtype.kind == "f" else a
 
 
 # the board

@@ -16,7 +16,7 @@ import numpy as np
 
 from jaxatt import check
 from jaxatt.yardstick import metrics, worlds
-from jaxatt.yardstick.calibration import threshold_of, threshold_slope, typed, windows_of
+from jaxatt.yardstick.calibration import threshold_of, threshold_slopes, typed, windows_of
 from jaxatt.yardstick.harness import slopes
 from jaxatt.yardstick.telemetry import Detector
 from jaxatt.yardstick.worlds import SIZED, World
@@ -57,24 +57,15 @@ def at_fixed_rate(
     days, key, n, modes = check.whole("days", days, 1), typed(key), windows_of(hours), len(world.modes)
     calm, test = (jax.random.fold_in(key, i) for i in (1, 3))
     told, moved = slopes(world, [detector], calm, worlds.days(world, calm, np.arange(n), None), numbers, params_of)
-    h, slope, error, spread = [], [], [], []
-    for m in range(modes):
-        maxima = told.peak[m::modes, 0]
-        h.append(threshold_of(maxima, rate)[0])
-        found = threshold_slope(maxima, moved.peak[m::modes, 0, :-modes], h[-1])
-        slope.append(found[0])
-        error.append(found[1])
-        spread.append(np.std(maxima))
+    maxima = [told.peak[m::modes, 0] for m in range(modes)]
+    h = [threshold_of(a, rate)[0] for a in maxima]
+    slope, error = (a[0] for a in threshold_slopes(told.peak, moved.peak, [h]))
+    width = WIDTH * float(np.mean([np.std(a) for a in maxima]))
     cells = [(kind, size) for kind, sizes in SIZED.items() for size in sizes]
     weights = np.repeat(metrics.weights_of(cells, SIZED), days) / days
     both = jax.tree.map(lambda *a: np.repeat(np.array(a, np.float32), days), *(worlds.effects(cell) for cell in cells))
     faulty = worlds.days(world, test, np.tile(np.arange(days), len(cells)), both)
-    told, moved = slopes(
-        world, [detector], test, faulty, numbers, params_of, threshold=[h], width=WIDTH * float(np.mean(spread))
-    )
+    told, moved = slopes(world, [detector], test, faulty, numbers, params_of, threshold=[h], width=width)
     here = np.einsum("n,nk->k", weights, moved.delay[:, 0])
     k = len(np.ravel(numbers))
-    slope = np.array(slope)
-    return Step(
-        float(weights @ told.delay[:, 0]), here[:k] + here[k:] @ slope, here[:k], np.array(h), slope, np.array(error)
-    )
+    return Step(float(weights @ told.delay[:, 0]), here[:k] + here[k:] @ slope, here[:k], np.array(h), slope, error)

@@ -177,7 +177,7 @@ def run(
     params = Params(
         world.params, tuple(d.params for d in detectors), wide(threshold, (n, modes)), wide(excess, (modes,))
     )
-    params = jax.tree.map(_short, params)
+    params = jax.tree.map(worlds.short, params)
     with np.errstate(all="ignore"):
         found = sweep(system, params, days, key, ticks=PACKETS, score=score, progress=progress)
     return found
@@ -222,7 +222,7 @@ def slopes(
     system = watched(world.system, tuple((d.init, d.step) for d in detectors))
     axes = np.eye(len(x) + shape[1], dtype=np.float32)
     directions = axes[:, : len(x)], axes[:, len(x) :]
-    world_params, width = jax.tree.map(_short, (world.params, width))
+    world_params, width = jax.tree.map(worlds.short, (world.params, width))
     return jax.tree.map(np.asarray, _sloped(system, params_of)(directions, x, h, days, key, world_params, width))
 
 
@@ -238,9 +238,3 @@ def _sloped(system: System, params_of: Callable):
         return jax.jvp(lambda x, move: found(x, move, h, *rest), (x, jnp.zeros_like(h[0])), direction)
 
     return jitted(jax.vmap(along, in_axes=(0, *[None] * 6), out_axes=(None, -1)))
-
-
-def _short(a):
-    """A number in float32, the type of all runs of the yardstick."""
-    a = np.asarray(a)
-    return a.astype(np.float32) if a.dtype.kind == "f" else a

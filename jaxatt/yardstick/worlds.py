@@ -236,6 +236,12 @@ def days(world: World, key, numbers, cells) -> Any:
     return drawn(world.sample, key, numbers, jax.tree.map(lambda a: np.broadcast_to(a, numbers.shape), effects(cells)))
 
 
+def short(a) -> np.ndarray:
+    """A number in float32, the type of all runs of the yardstick."""
+    a = np.asarray(a)
+    return a.astype(np.float32) if a.dtype.kind == "f" else a
+
+
 def drawn(sample: Callable, key, numbers, cells) -> Any:
     """sample(key, number, cell) of all numbers, float32 NumPy arrays with n in front.
 
