@@ -36,9 +36,9 @@ EXPERIMENTS = {
     "cmg_loss": Experiment(100, 88, "figure_7"),
     "star_isolation": Experiment(70, 88, "roc"),
     "wheel_mrac": Experiment(30, 77, "loss_of_effectiveness"),
-    "microsat": Experiment(90, 50, "reconfiguration"),
+    "microsat": Experiment(90, 61, "reconfiguration"),
     "rare_events": Experiment(45, 16, "curves"),
-    "yardstick": Experiment(140, 42, "board"),
+    "yardstick": Experiment(140, 46, "board"),
 }
 NAMES = tuple(EXPERIMENTS)
 LOOPS = tuple(name for name in NAMES if find_spec(f"jaxatt.loops.{name}"))  # which have studies and a campaign
