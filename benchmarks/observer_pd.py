@@ -7,9 +7,6 @@ live; ``shipped`` is four steps per tick, ``one-step`` one.
 from __future__ import annotations
 
 import ctypes
-import os
-import subprocess
-import sys
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,7 +18,7 @@ import numpy as np
 import jaxatt
 from benchmarks.measure import c_library, cpu_ns, seconds
 from jaxatt import Fault, Vec3, sweep
-from jaxatt.compiling import compiled
+from jaxatt.compiling import allowed_cores, compiled
 from jaxatt.loops.observer_pd import START_UP, Params, Scenario, Scores, params, scenario, score, system
 from jaxatt.tuning import value_and_gradient
 
@@ -306,7 +303,7 @@ def rows(quick: bool):
                         )
     yield from _gradient()
     if not quick:
-        yield from _devices()
+        yield from _cores()
 
 
 def _row(name, value, unit):
@@ -339,30 +336,18 @@ def _gradient(n: int = 1024, ticks: int = 500):
     yield _row("gradient of 2000 steps, memory", gradient.memory_analysis().temp_size_in_bytes / 2**20, "MiB")
 
 
-def _devices():
-    """Wall time of a sweep on one device over that on two, in processes of their own."""
-    if (os.cpu_count() or 1) < 2:
+def _cores():
+    """Wall time of a sweep on one core over that on all, in turns."""
+    if allowed_cores() < 2:
         return
-    wall = {}
-    for devices in (1, 2):
-        flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={devices}"
-        done = subprocess.run(
-            [sys.executable, "-m", "benchmarks.observer_pd"], env={**os.environ, "XLA_FLAGS": flags},
-            capture_output=True, text=True, check=True,
-        )  # fmt: skip
-        wall[devices] = float(done.stdout)
-    yield _row("two devices over one, wall time", wall[1] / wall[2], "x")
-
-
-def _wall() -> float:
-    s = scenarios(8192, np.float32)
+    s = scenarios(12_800, np.float32)
     p = jax.tree.map(lambda a: np.asarray(a, np.float32), params)
     run = partial(sweep, system, p, s, jax.random.key(0), ticks=TICKS, score=score, progress=False)
     run()
-    return min(seconds(run) for _ in range(5))
-
-
-if __name__ == "__main__":
-    jax.config.update("jax_enable_x64", True)
-    jaxatt.configure()
-    print(_wall())
+    ratios = []
+    for _ in range(7):
+        jaxatt.configure(cores=1)
+        one = seconds(run)
+        jaxatt.configure()
+        ratios.append(one / seconds(run))
+    yield _row(f"one core over {allowed_cores()}, wall time", float(np.median(ratios)), "x")

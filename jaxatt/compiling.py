@@ -9,7 +9,9 @@ import hashlib
 import logging
 import os
 import platform
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Generator, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
 
@@ -71,6 +73,50 @@ def jitted(f: Callable, static: int = 0) -> Callable:
     return jax.jit(f, static_argnums=tuple(range(static)), compiler_options=options)
 
 
+_cores: int | None = None  # what `configure` was told
+
+
+def programs_at_once() -> int:
+    """How many compiled programs keep this machine busy: one a core of a single CPU device, else two a device."""
+    devices = jax.local_devices()
+    if len(devices) > 1 or devices[0].platform != "cpu":
+        return 2 * len(devices)
+    return _cores or allowed_cores()
+
+
+def allowed_cores() -> int:
+    """How many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def in_threads(f: Callable, items: Iterable, jobs: int | None = None) -> Generator:
+    """f(item) of all items, in order, with ``jobs`` threads at work; None for `programs_at_once`, 1 for this thread.
+
+    A device runs the programs of one thread one after the other, but those of several threads side by side.
+    """
+    jobs = programs_at_once() if jobs is None else jobs
+    if jobs == 1 or jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
+        yield from map(f, items)
+        return
+    # settings that `with` makes hold in one thread only
+    wide, promotion = jax.config.jax_enable_x64, jax.config.jax_numpy_dtype_promotion  # pyright: ignore[reportAttributeAccessIssue]
+
+    def there(item):
+        with jax.enable_x64(wide), jax.numpy_dtype_promotion(promotion):
+            return f(item)
+
+    pool, under_way = ThreadPoolExecutor(jobs), deque()
+    try:
+        for item in items:
+            under_way.append(pool.submit(there, item))
+            if len(under_way) == 2 * jobs:
+                yield under_way.popleft().result()
+        while under_way:
+            yield under_way.popleft().result()
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
 _FLAGS = {
     "--xla_cpu_prefer_vector_width": "512",
     # loops of up to 20 MB become one compiled function; larger ones, of gradients, would take minutes to compile
@@ -78,7 +124,7 @@ _FLAGS = {
 }
 
 
-def configure(cache: str | Path | None = None) -> Path:
+def configure(cache: str | Path | None = None, cores: int | None = None) -> Path:
     """Switch on JAX's persistent compilation cache and the CPU compiler's flags for loops.
 
     With the cache a program is compiled once per machine, not once per process: the first sweep of a second process
@@ -90,6 +136,8 @@ def configure(cache: str | Path | None = None) -> Path:
         cache: folder of compiled programs; None for ``jaxatt`` in the user's cache folder. Processors and releases of
             JAX get folders of their own in it, for a program compiled for one fails on another. What
             JAX_COMPILATION_CACHE_DIR or jax.config says already stays.
+        cores: how many cores `sweep`, campaigns and `rare` keep busy; None for all that the process may use, as they do
+            without this call too. The numbers are the same.
 
     Returns:
         The folder in use.
@@ -101,6 +149,8 @@ def configure(cache: str | Path | None = None) -> Path:
         >>> import jaxatt
         >>> folder = jaxatt.configure()
     """
+    global _cores
+    _cores = None if cores is None else check.whole("cores", cores)
     if jax.__version_info__ < (0, 12):
         present = os.environ.get("XLA_FLAGS", "")
         wanted = [f"{name}={value}" for name, value in _FLAGS.items() if name not in present]

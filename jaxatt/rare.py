@@ -5,14 +5,13 @@ so that 1e-6 takes six levels and not a hundred million runs. A pilot chooses th
 each is an unbiased estimate and their spread is the interval. `design_point` finds the nearest failure by gradient,
 `importance` samples around it.
 
-May import: check, contract, design_point, engine, loss, noise, normal_space, reliability, resuming, subset, sweeping.
+May import: check, compiling, contract, design_point, engine, loss, noise, normal_space, reliability, resuming, subset, sweeping.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 
@@ -20,6 +19,7 @@ import jax
 import numpy as np
 
 from jaxatt import check
+from jaxatt.compiling import in_threads, programs_at_once
 from jaxatt.contract import System
 from jaxatt.design_point import Points, design_point, importance
 from jaxatt.engine import simulate
@@ -94,7 +94,7 @@ def probability(
     kept = KEPT * repeats * event.size // event.chains
     size = f"`ticks` = {ticks} with `chains` = {chains}"
     check.fits_memory(size, event.bytes + kept, "use fewer chains, or runs of fewer ticks")
-    devices = devices[: int(max(1, min(len(devices), (check.free_memory() - kept) // event.bytes)))]
+    jobs = int(max(1, min(max(len(devices), programs_at_once()), (check.free_memory() - kept) // event.bytes)))
     numbers = key, event.params, event.scenario, ticks, event.above, chains, moves
     mark = "" if path is None else mark_of(programs(event, key), numbers)
     pilot, done, looks = _resumed(path, mark, repeats)
@@ -113,24 +113,12 @@ def probability(
             with jax.default_device(devices[r % len(devices)]), jax.debug_nans(False), jax.debug_infs(False):
                 return populated(event, block_key(key, 1 + r), pilot, partial(_advance, bar, levels))
 
-        for found in _each(one, range(len(done), repeats), len(devices)):
+        for found in in_threads(one, range(len(done), repeats), jobs):
             done.append(found)
             if len(done) == repeats:
                 looks += 1
             _saved(path, mark, pilot, done, looks)
     return _loss(event, pilot, done, looks, label, began)
-
-
-def _each(one: Callable, numbers: range, devices: int):
-    """one(r) of all numbers, in order: one after the other, or side by side on several devices."""
-    if devices == 1:
-        yield from map(one, numbers)
-    else:
-        pool = ThreadPoolExecutor(devices)
-        try:
-            yield from pool.map(one, numbers)
-        finally:
-            pool.shutdown(cancel_futures=True)
 
 
 def _advance(bar, levels: int | None, level: int, p: float, acceptance: float) -> None:

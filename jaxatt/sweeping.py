@@ -8,7 +8,6 @@ May import: check, fields, contract, compiling, noise, engine, scores.
 from __future__ import annotations
 
 import sys
-from collections import deque
 from collections.abc import Callable
 from functools import lru_cache, partial
 from typing import Any, overload
@@ -19,7 +18,7 @@ import numpy as np
 from tqdm import tqdm
 
 from jaxatt import check, scores
-from jaxatt.compiling import compiled, shared, traced
+from jaxatt.compiling import compiled, in_threads, shared, traced
 from jaxatt.contract import Score, System
 from jaxatt.engine import over_lanes, run, start, step, times, tree_bytes, validated
 from jaxatt.noise import BLOCK, CHUNK, block_key, chunk_noise, one_key
@@ -220,30 +219,51 @@ def block_records(system: System, record: Callable, ticks: int, every: int, para
 # all blocks
 
 
-def scored(system, params, scenarios, key, ticks, score, first: int = 0, advance: Callable = lambda n: None):
-    """What `sweep` gives, of validated input: the blocks first, first + 1, ... on every local device, one host loop.
+def scored(system, params, scenarios, key, ticks, score, first: int = 0, advance: Callable = lambda n: None, jobs=None):
+    """What `sweep` gives, of validated input: the blocks first, first + 1, ... in one host loop.
 
-    advance(n) is called when n more scenarios are done.
+    advance(n) is called when n more scenarios are done; jobs: how many blocks at once, as of `by_block`.
+    """
+
+    def call(params, here, key, block):
+        return compiled(block_scores, 2)(system, score, np.int32(ticks), params, here, key, block)
+
+    found = by_block(call, params, scenarios, key, first, advance, jobs)
+    return jax.tree.map(lambda a: np.moveaxis(a, -1, 0), found)
+
+
+def recorded(system, record, ticks: int, every: int, params, scenarios, key, first: int = 0, jobs=None):
+    """`block_records` of the blocks first, first + 1, ..., as NumPy arrays of shape (records, ..., n)."""
+
+    def call(params, here, key, block):
+        return compiled(block_records, 4)(system, record, ticks, every, params, here, key, block)
+
+    return by_block(call, params, scenarios, key, first, jobs=jobs)
+
+
+def by_block(call: Callable, params, scenarios, key, first: int, advance: Callable = lambda n: None, jobs=None):
+    """call(params, here, key, block) of all blocks, joined along the lanes, which come last, as NumPy arrays.
+
+    Several blocks run at once: on every local device, and on every core of a single CPU device, each in a thread, for
+    a device takes up one program at a time from each thread. jobs: how many; None for `programs_at_once`.
     """
     scenarios = jax.tree.map(np.asarray, scenarios)
     n = len(jax.tree.leaves(scenarios)[0])
-    blocks = -(-n // BLOCK)
-    call = compiled(block_scores, 2)
     devices = jax.local_devices()
-    at = [jax.device_put((np.int32(ticks), params, key), device) for device in devices]
-    under_way: deque = deque()
-    done: list = []
-    for block in range(blocks + 2 * len(devices)):
-        if block < blocks:
-            ticks, params, key = at[block % len(devices)]  # they decide where it runs
-            here = block_of(scenarios, block)
-            with jax.debug_nans(False), jax.debug_infs(False):  # a NaN is the answer where a window was empty
-                under_way.append(call(system, score, ticks, params, here, key, np.int32(first + block)))
-        if under_way and block >= 2 * len(devices) - 1:
-            done.append(jax.tree.map(np.asarray, under_way.popleft()))
-            advance(min(BLOCK, n - (len(done) - 1) * BLOCK))
-    join = lambda *parts: np.moveaxis(np.concatenate(parts, axis=-1)[..., :n], -1, 0)
-    return jax.tree.map(join, *done)
+    at = [jax.device_put((params, key), device) for device in devices]  # they decide where a block runs
+
+    def start(block: int):
+        params, key = at[block % len(devices)]
+        with jax.debug_nans(False), jax.debug_infs(False):  # a NaN is the answer where a window was empty
+            return call(params, block_of(scenarios, block), key, np.int32(first + block))
+
+    done = [start(0)]  # in this thread, lest two compile it
+    for out in in_threads(lambda block: jax.tree.map(np.asarray, start(block)), range(1, -(-n // BLOCK)), jobs):
+        advance(BLOCK)
+        done.append(out)
+    done[0] = jax.tree.map(np.asarray, done[0])
+    advance(n - BLOCK * (len(done) - 1))
+    return jax.tree.map(lambda *parts: np.concatenate(parts, axis=-1)[..., :n], *done)
 
 
 def score_shapes(system, params, scenarios, key, ticks, score):

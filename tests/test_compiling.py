@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import jaxatt
-from jaxatt.compiling import compiled, jitted, shared, traced
+from jaxatt.compiling import allowed_cores, compiled, in_threads, jitted, programs_at_once, shared, traced
 
 ROOT = Path(__file__).parents[1]
 
@@ -30,6 +30,43 @@ def six(x, once):
     """Six outputs, each large enough to be a kernel of its own, that use one value."""
     y = once(long, x)
     return [y[i::6] * i for i in range(6)]
+
+
+# several programs at once
+
+
+@pytest.mark.parametrize("jobs", [1, 3])
+def test_results_come_in_order_and_no_more_is_begun_than_asked_for(jobs):
+    begun = []
+
+    def f(i):
+        begun.append(i)
+        return i * i
+
+    found = in_threads(f, iter(range(50)), jobs)
+    assert [next(found) for _ in range(3)] == [0, 1, 4]
+    assert len(begun) <= 3 + 2 * jobs
+    found.close()
+    settled = len(begun)
+    assert settled < 50 and list(in_threads(f, range(5), jobs)) == [0, 1, 4, 9, 16]
+
+
+def test_threads_work_with_the_settings_of_their_caller():
+    for wide in (False, True):
+        with jax.enable_x64(wide), jax.numpy_dtype_promotion("strict"):
+            kinds = list(in_threads(lambda _: jnp.zeros(1).dtype, range(3), 2))
+            with pytest.raises(Exception, match="promotion"):
+                list(in_threads(lambda _: jnp.zeros(1, int) + jnp.zeros(1), range(3), 2))
+        assert kinds == [np.float64 if wide else np.float32] * 3
+
+
+def test_cores_are_counted_and_refused():
+    jaxatt.configure(cores=3)
+    assert programs_at_once() == 3
+    jaxatt.configure()
+    assert programs_at_once() == allowed_cores() >= 1
+    with pytest.raises(ValueError, match=r"`cores` must be .*, but it is 0"):
+        jaxatt.configure(cores=0)
 
 
 # values computed once

@@ -14,9 +14,10 @@ from made_up import compilations, repeated
 from toy import SYSTEM, Params, Scenario
 
 from jaxatt import check, scores
-from jaxatt.engine import simulate
-from jaxatt.noise import noise_of
-from jaxatt.sweeping import block_of, block_records, rerun, sweep, varied
+from jaxatt.compiling import configure
+from jaxatt.engine import prepared, simulate
+from jaxatt.noise import noise_of, one_key
+from jaxatt.sweeping import block_of, block_records, rerun, scored, sweep, varied
 
 ROOT = Path(__file__).parents[1]
 KEY = jax.random.key(11)
@@ -104,6 +105,28 @@ def test_one_device_or_three_give_the_same_bits(tmp_path):
     there = list(np.load(tmp_path / "x.npz").values())
     assert same_bits(here, there)
     assert [a.dtype for a in there[2::3]] == [np.float32, np.float64]
+
+
+def test_one_core_or_three_give_the_same_bits(three_hundred):
+    with jax.enable_x64(False):
+        short = swept(many(300, np.float32))
+    for cores in (1, 3):
+        configure(cores=cores)
+        assert same_bits(swept(many(300)), three_hundred)
+        with jax.enable_x64(False):  # which holds in this thread only
+            found = swept(many(300, np.float32))
+        assert same_bits(found, short) and found["rms"].dtype == np.float32
+    configure()
+
+
+def test_an_error_in_one_block_ends_the_sweep():
+    def fail(n):
+        raise RuntimeError(f"{n} more")
+
+    configure(cores=2)
+    with pytest.raises(RuntimeError, match="128 more"):
+        scored(SYSTEM, *prepared(SYSTEM, Params(), many(900)), one_key(KEY), TICKS, score, advance=fail)
+    configure()
 
 
 def test_another_number_of_scenarios_key_params_and_ticks_compile_nothing(three_hundred):

@@ -21,7 +21,7 @@ from jaxatt.contract import System
 from jaxatt.engine import prepared, tree_bytes, validated
 from jaxatt.fields import named, units_within
 from jaxatt.noise import BLOCK, one_key
-from jaxatt.sweeping import block_of, block_records, score_shapes, scored
+from jaxatt.sweeping import block_of, block_records, recorded, score_shapes, scored
 
 
 class Campaign(NamedTuple):
@@ -117,28 +117,26 @@ def _draw(sample, inputs, key, indices):
     return jax.vmap(one)(indices)
 
 
-def results(campaign: Campaign, start: int, stop: int, advance: Callable = lambda n: None) -> dict[str, np.ndarray]:
+def results(
+    campaign: Campaign, start: int, stop: int, advance: Callable = lambda n: None, jobs=None
+) -> dict[str, np.ndarray]:
     """All that is stored of the scenarios start .. stop - 1, by name, each of shape (..., stop - start).
 
-    start: a multiple of 128. The scores are those of `sweep`, bit for bit. advance(n): n more are done.
+    start: a multiple of 128. The scores are those of `sweep`, bit for bit. advance(n): n more are done; jobs: blocks at once, as of `sweeping.by_block`.
     """
     scenarios, inputs = drawn(campaign, start, stop)
     params, scenarios = prepared(campaign.system, campaign.params, scenarios)
     bad = refused(campaign.system, params, scenarios, campaign.ticks)
     values = scored(
-        campaign.system, params, scenarios, campaign.key, campaign.ticks, campaign.score, start // BLOCK, advance
+        campaign.system, params, scenarios, campaign.key, campaign.ticks, campaign.score, start // BLOCK, advance, jobs
     )
     out = {name: np.moveaxis(a, 0, -1) for name, a in named(values, "score").items()}
     good = out.get("ok", np.ones(stop - start, bool)).astype(bool)
     out["status"] = np.where(bad, 2, np.where(good, 0, 1)).astype(np.int8)
     out |= {name: np.moveaxis(a, 0, -1) for name, a in named(inputs, "input").items()}
     if campaign.record is not None:
-        run, parts = compiled(block_records, 4), []
-        static = campaign.system, campaign.record, campaign.ticks, campaign.every
-        for block in range(-(-(stop - start) // BLOCK)):
-            here, number = block_of(scenarios, block), np.int32(start // BLOCK + block)
-            parts.append(jax.tree.map(np.asarray, run(*static, params, here, campaign.key, number)))
-        records = jax.tree.map(lambda *a: np.concatenate(a, axis=-1)[..., : stop - start], *parts)
+        how = campaign.ticks, campaign.every, params, scenarios, campaign.key, start // BLOCK, jobs
+        records = recorded(campaign.system, campaign.record, *how)
         out |= named(records, "record")
     return out
 

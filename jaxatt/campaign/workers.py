@@ -56,7 +56,7 @@ def run(path, campaign: Campaign, n: int, *, shard: tuple[int, int] = (0, 1), ex
         n: how many scenarios.
         shard: (k, m) for the k-th of m processes that share one store, such as the tasks of a Slurm array.
         executor: of concurrent.futures, such as a process pool or Dask's ``Client.get_executor()``: computes the
-            blocks; without one they run on the local devices. Its workers need the environment of this process,
+            blocks, each on one core; without one they run on all cores and devices. Its workers need the environment of this process,
             XLA_FLAGS too, and must not be forked from it. This process alone writes.
         accept: names in the manifest that may differ from the store's, such as ``jax``; then the bits of later blocks
             are those of another program, and nothing is compared by trial.
@@ -240,7 +240,7 @@ def _task(payload: bytes, sender: dict, start: int, stop: int) -> dict[str, np.n
         differ = [f"{k} is {here[k]!r}, but {sender[k]!r} there" for k in here if here[k] != sender[k]]
         if differ:
             raise ValueError(f"`executor` must have workers like this process, but these differ: {'; '.join(differ)}.")
-        return results(_loaded(payload), start, stop)
+        return results(_loaded(payload), start, stop, jobs=1)  # the executor's workers are as many as it wants
 
 
 def until(path, campaign: Campaign, looks, success: Callable, half_width: float, *, level: float = 0.95, **how

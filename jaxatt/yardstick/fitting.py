@@ -14,10 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxatt import check
-from jaxatt.compiling import compiled
 from jaxatt.contract import no_check
-from jaxatt.noise import BLOCK, one_key
-from jaxatt.sweeping import block_of, block_records
+from jaxatt.noise import one_key
+from jaxatt.sweeping import recorded
 from jaxatt.yardstick import bank, baselines, leo4, worlds
 from jaxatt.yardstick.telemetry import Detector, OnResiduals, residuals_init, residuals_step, with_residuals
 
@@ -62,13 +61,9 @@ def healthy(key=None, windows: int = WINDOWS) -> Healthy:
     world = worlds.WORLDS["leo4"]
     days = worlds.days(world, jax.random.wrap_key_data(key), np.arange(windows), None)
     params = jax.tree.map(lambda a: np.asarray(a, np.float32), world.params)
-    call, found = compiled(block_records, 4), []
-    for block in range(-(-windows // BLOCK)):
-        here = block_of(days, block)
-        records = call(_SYSTEM, _both, worlds.PACKETS, 1, params, here, key, np.int32(block))
-        skipped = round(worlds.WARMUP / leo4.PACKET)
-        found.append([np.moveaxis(np.asarray(a[skipped:], np.float32), -1, 0) for a in records])
-    return Healthy(*(np.concatenate(parts)[:windows] for parts in zip(*found)))
+    records = recorded(_SYSTEM, _both, worlds.PACKETS, 1, params, days, key)
+    skipped = round(worlds.WARMUP / leo4.PACKET)
+    return Healthy(*(np.moveaxis(np.asarray(a[skipped:], np.float32), -1, 0) for a in records))
 
 
 @lru_cache

@@ -17,9 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxatt import check
-from jaxatt.compiling import compiled, jitted
+from jaxatt.compiling import jitted
 from jaxatt.noise import one_key
-from jaxatt.sweeping import block_of, block_records
+from jaxatt.sweeping import recorded
 from jaxatt.yardstick import leo4, worlds
 from jaxatt.yardstick.telemetry import Detector, Telemetry
 
@@ -60,11 +60,8 @@ def records() -> Telemetry:
     world, key = worlds.WORLDS["leo4"], jax.random.key(1)
     days = worlds.days(world, key, np.arange(DAYS), None)
     params = jax.tree.map(lambda a: np.asarray(a, np.float32), world.params)
-    run = compiled(block_records, 4)
-    blocks = [
-        run(leo4.system, _telemetry, PACKETS, 1, params, block_of(days, b), one_key(key), np.int32(b)) for b in range(2)
-    ]
-    return jax.tree.map(lambda *a: np.moveaxis(np.concatenate(a, axis=-1), -1, 1), *blocks)
+    found = recorded(leo4.system, _telemetry, PACKETS, 1, params, days, one_key(key))
+    return jax.tree.map(lambda a: np.moveaxis(a, -1, 1), found)
 
 
 def _telemetry(log):
