@@ -77,11 +77,12 @@ _cores: int | None = None  # what `configure` was told
 
 
 def programs_at_once() -> int:
-    """How many compiled programs keep this machine busy: one a core of a single CPU device, else two a device."""
+    """How many compiled programs keep this machine busy: 1 on one core, else two a core or device, one of them waiting."""
     devices = jax.local_devices()
     if len(devices) > 1 or devices[0].platform != "cpu":
         return 2 * len(devices)
-    return _cores or allowed_cores()
+    cores = _cores or allowed_cores()
+    return 2 * cores if cores > 1 else 1
 
 
 def allowed_cores() -> int:

@@ -62,9 +62,11 @@ def test_threads_work_with_the_settings_of_their_caller():
 
 def test_cores_are_counted_and_refused():
     jaxatt.configure(cores=3)
-    assert programs_at_once() == 3
+    assert programs_at_once() == 6
+    jaxatt.configure(cores=1)
+    assert programs_at_once() == 1
     jaxatt.configure()
-    assert programs_at_once() == allowed_cores() >= 1
+    assert programs_at_once() >= allowed_cores() >= 1
     with pytest.raises(ValueError, match=r"`cores` must be .*, but it is 0"):
         jaxatt.configure(cores=0)
 
