@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 from itertools import product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -61,10 +61,10 @@ def _directions(name: str, u: Vec3) -> Vec3:
 # grids
 
 
-def ill_conditioned(axes: GimbalAxes, points: int, threshold=100.0) -> tuple[int, int]:
+def ill_conditioned(axes: GimbalAxes, points: int, threshold: Any = 100.0) -> tuple[Any, int]:
     """How many of the points^n gimbal-angle combinations have condition >= threshold, and points^n (Table 3).
 
-    points: of a grid from 0 to 360 deg without its end. The grid runs by blocks and is never held. An angle and its
+    points: of a grid from 0 to 360 deg without its end. threshold: one, or several, which are counted at once, (k,). The grid runs by blocks and is never held. An angle and its
     opposite give the same condition number, t(gamma + 180 deg) = -t(gamma), so an even number of points needs 1/2^n of
     the grid. The grid says how often T is ill conditioned, not how large the singular set is: see `singular_area`.
 
@@ -75,7 +75,9 @@ def ill_conditioned(axes: GimbalAxes, points: int, threshold=100.0) -> tuple[int
     n = _modules(axes)
     check_cluster("axes", axes)
     fold = 2 if points % 2 == 0 else 1
-    return int(_count(axes, points // fold, points, threshold)) * fold**n, points**n
+    counts = _count(axes, points // fold, points, np.ravel(np.asarray(threshold, float))).tolist()
+    counts = [count * fold**n for count in counts]
+    return (np.array(counts) if np.ndim(threshold) else counts[0]), points**n
 
 
 @partial(jax.jit, static_argnums=(1, 2))
@@ -90,10 +92,12 @@ def _count(axes: GimbalAxes, kept: int, points: int, threshold):
     def block(index, count):
         angles = jnp.unravel_index(index, (kept,) * (n - 2))
         l1, _, l3 = squared_singular_values([*(Vec3(*(a[i] for a in c)) for c, i in zip(rest, angles)), row, line])
-        return count + (l1 >= threshold * threshold * l3).sum(0, dtype=jnp.int32)
+        above = l1 >= (threshold * threshold)[:, None, None] * l3
+        return count + above.sum(1, dtype=jnp.int32)
 
-    count = jax.lax.fori_loop(0, kept ** (n - 2), block, jnp.zeros(kept, jnp.int32))
-    return count.sum(dtype=jnp.result_type(int))
+    threshold = threshold.astype(dtype)
+    count = jax.lax.fori_loop(0, kept ** (n - 2), block, jnp.zeros((len(threshold), kept), jnp.int32))
+    return count.sum(1, dtype=jnp.result_type(int))
 
 
 # singular momenta

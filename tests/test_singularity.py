@@ -45,6 +45,11 @@ def test_grid_counts_against_svd(axes, points, threshold):
     assert sg.ill_conditioned(axes, points, threshold) == (count, points**n)
 
 
+def test_several_thresholds_are_counted_at_once():
+    several, of = sg.ill_conditioned(THREE["box"], 45, [10.0, 30.0])
+    assert several.tolist() == [sg.ill_conditioned(THREE["box"], 45, k)[0] for k in (10.0, 30.0)] and of == 45**3
+
+
 @pytest.mark.parametrize("axes", [*THREE.values(), *FOUR.values()])
 def test_singular_momenta_are_singular(axes):
     u = sg.sphere(100)
