@@ -1,7 +1,7 @@
 """The site's figures: ``python docs/figures.py RESULTS`` after ``python -m experiments --quick --out RESULTS``.
 
 Takes the figures that the pages name from the results, draws the overview, and stores all as palette PNGs, a third
-of the size. Then it runs `benchmarks.check_cases` and puts its tables on the page `trust.md`.
+of the size, and a movie of one run as a GIF. Then it runs `benchmarks.check_cases` and puts its tables on the page `trust.md`.
 """
 
 import json
@@ -18,6 +18,7 @@ import numpy as np
 from PIL import Image
 
 import jaxatt
+from jaxatt import view
 from jaxatt.loops import observer_pd as loop
 from jaxatt.plot import COLOURS
 
@@ -69,6 +70,26 @@ def overview():
     right.legend(loc="upper left", fontsize="small")
     fig.colorbar(image, ax=right, label="share of faulty time with alarm [1]")
     fig.savefig(HERE / "figures" / "overview.png", dpi=130)
+
+
+def tumble():
+    """A body that tumbles at first, an estimate that starts wrong, and a gyro that fails at 20 s, as a GIF of few colours."""
+    healthy = jaxatt.on_axes(jaxatt.Fault())
+    scenario = loop.scenario._replace(
+        w=jaxatt.Vec3(-0.2, 0.1, 0.2), q_hat=jaxatt.Vec3(0.0, 0.4, -0.3), w_hat=jaxatt.Vec3(0.0, 0.0, 0.0), star=healthy,
+        gyro=healthy._replace(x=jaxatt.Fault(onset=20.0, bias=0.5)),
+    )  # fmt: skip
+    log = jaxatt.simulate(loop.system, loop.params, scenario, jax.random.key(0), ticks=280)
+    sun = {"Sun": jaxatt.Vec3(1.0, -0.5, 0.7)}
+    path = view.movie(log, HERE / "figures" / "tumble.gif", directions=sun, size=(1.0, 1.0, 1.6), frames=44, pixels=280)
+    with Image.open(path) as movie:
+        pictures = []
+        for i in range(movie.n_frames):
+            movie.seek(i)
+            pictures.append(movie.convert("RGB"))
+    palette = pictures[-1].quantize(36, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+    first, *others = (picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures)
+    first.save(path, save_all=True, append_images=others, duration=100, loop=0, optimize=False)
 
 
 def shrunk(source: Path, target: Path) -> None:
@@ -123,6 +144,7 @@ if __name__ == "__main__":
     check_cases()
     jaxatt.configure()
     overview()
+    tumble()
     shrunk(HERE / "figures" / "overview.png", HERE / "figures" / "overview.png")
     pages = [*HERE.glob("loops/*.md"), HERE / "guides" / "rare_events.md"]
     named = {name for page in pages for name in re.findall(r"figures/(\w+)\.png", page.read_text())}

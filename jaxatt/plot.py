@@ -4,7 +4,7 @@ Data is what the other modules give: logs and scores (NamedTuples), dicts of arr
 ``pandas.DataFrame`` whose columns lead to arrays of shape (n,). Every axis carries a unit: names end in one,
 "delay [s]", "[1]" for a pure number; the units that fields state do as well, a dataset's ``units``, and ``labels``.
 Colours are Okabe and Ito's, with a contrast of 3 or more on white and on black; text follows matplotlib's style.
-Nothing in the package imports this module.
+In the package `jaxatt.view` alone imports this module.
 
 May import: check, fields, vec, faults, cmg, evaluation, singularity.
 """

@@ -42,6 +42,7 @@ MEETING = [
     "sweeping",
     "tables",
     "tuning",
+    "view",
     "campaign.designs",
     "campaign.summary",
 ]

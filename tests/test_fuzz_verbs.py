@@ -61,6 +61,8 @@ from jaxatt.tuning import (
     value_and_gradient,
     worst_case,
 )
+from jaxatt.vec import Vec3
+from jaxatt.view import movie, picture
 
 # the verbs, on a loop that compiles at once
 
@@ -416,6 +418,33 @@ def test_figures(name):
             {name, "label", "name", *strategies, *ALSO, *map(str, TABLE)},
             **arguments,
         )
+        plt.close("all")
+
+    run()
+
+
+LOG = {"t": np.arange(3.0), "q": Vec3(*np.zeros((3, 3))), "alarm": np.ones(3, bool)}
+attitudes = st.one_of(st.sampled_from(["q", "alarm", "x"]), st.none(), tuples(Vec3, st.one_of(arrays([(3,)]), plain())))
+VIEWED = dict(
+    log=st.one_of(st.dictionaries(st.sampled_from(["t", "q", "alarm", "estimate"]), st.one_of(plain(), vectors)), datasets(), junk),
+    attitude=attitudes, estimate=attitudes, alarm=st.one_of(attitudes, arrays([(3,)])), size=st.one_of(arrays([(3,)]), plain()),
+    directions=st.one_of(st.none(), st.dictionaries(st.just("Sun"), tuples(Vec3), max_size=1), junk),
+)  # fmt: skip
+VIEWS = {
+    "picture": (picture, VIEWED | dict(at=st.one_of(st.none(), plain()), ax=ax)),
+    "movie": (movie, VIEWED | dict(path=st.sampled_from(["a.png", "none/a.gif", "", None, 3]), frames=whole, rate=plain(), pixels=whole)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", VIEWS)
+def test_views(name):
+    f, strategies = VIEWS[name]
+    good = dict(log=LOG, attitude="q", estimate=None, alarm=None, size=(1, 1, 1), directions=None, at=None, ax=None)
+
+    @fuzzed
+    @given(nearly(good | dict(frames=2, rate=1.0, pixels=40), strategies))
+    def run(arguments):
+        judged(lambda **how: (f(**how), None)[1], {*strategies, "Sun", "t"}, **arguments)
         plt.close("all")
 
     run()
