@@ -252,7 +252,7 @@ def _direction(name: str, v, n: int) -> np.ndarray:
 # drawing
 
 
-def _draw(ax: Axes3D, run: _Run, i: int) -> None:
+def _draw(ax: Any, run: _Run, i: int) -> None:
     words = plt.rcParams["text.color"]
     ax.set(xlim=(-1, 1), ylim=(-1, 1), zlim=(-0.85, 1.15))
     ax.set_axis_off()
