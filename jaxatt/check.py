@@ -277,6 +277,14 @@ def place(name: str, value) -> Path:
     return Path(value)
 
 
+def new_file(name: str, value) -> Path:
+    """Refuse what names no file in a folder that is there; return it as a path."""
+    path = place(name, value)
+    if path.is_dir() or not path.parent.is_dir():
+        refuse(name, "name a file in a folder that is there", repr(str(path)))
+    return path
+
+
 def mapping(name: str, value) -> None:
     """Refuse, with TypeError, what is not a mapping."""
     if not isinstance(value, Mapping):

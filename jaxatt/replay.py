@@ -11,7 +11,7 @@ moves between ticks (`observer_pd`, `wheel_mrac`), ``flow=loop.computer_flow`` a
 `load` reads a file of text or Parquet, which never executes code, `report` says what it understood, `merged` joins the clocks
 of several instruments, `unit_quaternions` mends quaternions of few digits, and `resample` brings samples to the ticks.
 
-May import: check, clock, faults, contract, compiling, engine, loading, logfiles.
+May import: check, faults, compiling, loading, logfiles, stepping.
 """
 
 from __future__ import annotations
@@ -25,13 +25,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxatt import check
-from jaxatt.clock import time_of
 from jaxatt.compiling import compiled
-from jaxatt.contract import Now
-from jaxatt.engine import alone, match_state, rk4
 from jaxatt.faults import Reading
 from jaxatt.loading import DIRECTIONS, Quaternion, Understood, agree, report_of, understood
 from jaxatt.logfiles import Layout
+from jaxatt.stepping import on_board
 
 EXAMPLE = Path(__file__).parent / "data" / "telemetry.csv"  # made by notebooks/telemetry.py, with a hidden fault
 SPARSE = 1000  # ticks per sample beyond which the times are taken to be wrong
@@ -105,38 +103,9 @@ def _length(name: str, tree) -> int:
 
 
 def _replay(decide, flow, dt, substeps, params, computer, readings, between):
-    dtype = check.float_type((params, computer, readings))
-    h = dt / substeps
-
-    def flown(t, computer, y, stages):
-        def one(x, step):
-            at, seen = step
-
-            def rate(t, x, now=y):
-                return match_state(flow(params, computer._replace(**x), now), x, "flow")
-
-            return rk4(rate, at, x, h, seen), None
-
-        rates = jax.eval_shape(flow, params, computer, y)
-        if not isinstance(rates, dict) or not set(rates) <= set(getattr(computer, "_fields", ())):
-            raise TypeError(f"`flow` must return a dict by fields of the computer, but it is {check.short(rates)}.")
-        moving = {name: getattr(computer, name) for name in rates}
-        times = t + h * jnp.arange(substeps, dtype=dtype)
-        return computer._replace(**jax.lax.scan(one, moving, (times, stages))[0])
-
     @jax.checkpoint
     def tick(computer, told):
-        k, y, stages = told
-        now = Now(k, time_of(k, dt, dtype), dt)
-
-        def one(computer, y):
-            out = decide(params, now, computer, y)
-            if not isinstance(out, tuple) or len(out) != 2:
-                raise TypeError(f"`decide` must return computer, log, but it is {check.short(out)}.")
-            return match_state(out[0], computer, "decide"), jax.tree.map(jnp.asarray, out[1])
-
-        after, log = alone(one, computer, y)
-        ahead = after if flow is None else flown(now.t, after, y, stages)
+        ahead, after, log = on_board(decide, flow, dt, substeps, params, told[0], computer, *told[1:])
         return ahead, (after, log)
 
     ticks = jnp.arange(len(jax.tree.leaves(readings)[0]))

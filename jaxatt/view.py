@@ -132,12 +132,10 @@ def movie(
     frames, pixels = check.whole("frames", frames), check.whole("pixels", pixels, 40)
     check.positive("rate", rate := check.number("rate", rate))
     check.fits_memory(f"`pixels` = {pixels}", 16 * pixels**2, "take fewer")
-    path = check.place("path", path)
+    path = check.new_file("path", path)
     writers = {".gif": PillowWriter, ".mp4": FFMpegWriter}
     if path.suffix not in writers:
         check.refuse("path", "end in .gif or .mp4", repr(path.name))
-    if not path.parent.is_dir():
-        check.refuse("path", "lie in a folder that is there", repr(str(path)))
     if not writers[path.suffix].isAvailable():
         check.refuse("path", "end in .gif where no ffmpeg is installed, which .mp4 needs", repr(path.name))
     figure = plt.figure(figsize=(pixels / 100, pixels / 100), dpi=100)

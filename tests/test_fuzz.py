@@ -33,6 +33,7 @@ MEETING = [
     "campaign",
     "design_point",
     "evaluation",
+    "exporting",
     "loss",
     "plot",
     "pointing",

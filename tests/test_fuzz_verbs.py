@@ -43,6 +43,7 @@ from jaxatt.evaluation import (
     quantile_interval,
     roc,
 )
+from jaxatt.exporting import write as export
 from jaxatt.faults import Reading
 from jaxatt.linear import sampled
 from jaxatt.loops import observer_pd
@@ -314,6 +315,14 @@ DATA = {
         t=st.one_of(st.just(np.arange(4.0)), st.just(np.array([0.0, 1.0, 1e9])), plain()), ticks=st.one_of(st.none(), whole, st.just(2**31 - 1)),
         columns=st.one_of(st.dictionaries(st.sampled_from("ab"), arrays([(4,)])), junk), dt=st.one_of(good(0.1, 2), plain()))),
     "together": (together, dict(readings=st.one_of(st.dictionaries(st.sampled_from("ab"), reading), junk), names=names)),
+    "export": (lambda path, decide, params, computer, readings, dt, flow, substeps, platforms: str(export(
+        path, decide, params, computer, readings, dt=dt, flow=flow, substeps=substeps, platforms=platforms)) and None,
+        dict(path=st.sampled_from([3, "a\0", "", "none/a.zip"]), params=st.one_of(st.just(()), plain()),
+             decide=st.sampled_from([decide, decide, None, 3]),  # no path is one, so that nothing is compiled
+             computer=st.one_of(st.just(Computer(0.0, 0.5)), tuples(Computer)), readings=st.one_of(arrays([(), (2,)]), reading, junk),
+             dt=st.one_of(good(0.1, 1), plain()), substeps=st.one_of(st.just(1), whole),
+             flow=st.sampled_from([None, None, lambda p, computer, y: {"w": -computer.w}, lambda p, computer, y: computer, 3]),
+             platforms=st.sampled_from([("cpu",), ("cpu",), ("cpu", "cuda"), (), "cpu", ("abacus",), 3, [None]]))),
     "replay": (lambda decide, params, computer, readings, dt, flow, substeps, between: replay(
         decide, params, computer, readings, dt=dt, flow=flow, substeps=substeps, between=between),
         dict(decide=st.sampled_from([decide, decide, decide, None, lambda *a: (a[2], None), lambda *a: (0.0, None)]),
@@ -346,7 +355,7 @@ fitting = GOOD | dict(
     computer=Computer(0.0, 0.5), between=None, n=60, x=np.ones(120),
     y=np.ones(120), healthy=np.arange(5.0), faulty=np.arange(5.0), thresholds=None, false_alarm=0.1, curve=Roc(*np.ones((3, 4))),
     alarms=np.arange(5) > 2, since=0.0, delays=np.ones(5), times=np.ones(5), samples=10, shares=0.5, truth=[0, 1, 2], verdict=[0, 2, 2], causes=5,
-    error=np.arange(5.0), window=2.0, apart=None, values=np.ones((5, 2)), how="mixed", confidence=0.5, rank=1,
+    path="none/a.zip", platforms=("cpu",), error=np.arange(5.0), window=2.0, apart=None, values=np.ones((5, 2)), how="mixed", confidence=0.5, rank=1,
 )  # fmt: skip
 
 
