@@ -45,14 +45,20 @@ def decide(params, now, computer, readings):
     return computer, Told(verdict, u, LMMSE.attitude(computer.filters.mean), readings)
 
 
+many = jax.vmap(decide, in_axes=(None, None, 0, 0))
+
+
 def scenario_of(onset: float, bias: float, noisy: bool = True):
     """The loop's day with a biased gyro about x and no other fault."""
     day = loop.scenario._replace(star=loop.HEALTHY, gyro=on_axes(Fault())._replace(x=Fault(onset=onset, bias=bias)))
     return day if noisy else day._replace(std_gyro=0.0, std_star=0.0)
 
 
-def flight(scenario, seconds: float, seed: int = 0):
-    """Times, computers and `Told` of a flight in Basilisk with the numbers of a scenario of the loop."""
+def flights(scenario, seconds: float, n: int = 1, seed: int = 0):
+    """Times, computers and `Told`, (T, n, ...), of n satellites in Basilisk with the numbers of a scenario of the loop.
+
+    One module steers them all: its ``decide`` is that of one satellite under `jax.vmap`.
+    """
     from Basilisk.architecture import messaging  # pyright: ignore[reportMissingImports]
     from Basilisk.simulation import (  # pyright: ignore[reportMissingImports]
         GravityGradientEffector,
@@ -70,38 +76,46 @@ def flight(scenario, seconds: float, seed: int = 0):
     sim, rng = SimulationBaseClass.SimBaseClass(), np.random.default_rng(seed)
     sim.CreateNewProcess("process").addTask(sim.CreateNewTask("task", macros.sec2nano(loop.DT)))
     column = lambda v: [[float(a)] for a in v]
-    count = 0
+    keep = []
 
-    def add(module, tag: str):
-        nonlocal count
-        count += 1
-        module.ModelTag = tag
-        sim.AddModelToTask("task", module, 100 - count)
+    def add(module, tag: str, priority: int):
+        module.ModelTag = f"{tag} {len(keep)}"
+        sim.AddModelToTask("task", module, priority)
+        keep.append(module)
         return module
 
-    # the truth: at the start the orbit's frame is the inertial one, x ahead and z down
-    craft, rate = add(spacecraft.Spacecraft(), "craft"), float(scenario.orbit_rate)
-    bodies = simIncludeGravBody.gravBodyFactory()
-    earth = bodies.createEarth()
-    earth.isCentralBody = True
-    bodies.addBodiesTo(craft)
-    far = float(np.cbrt(earth.mu / rate**2))
-    craft.hub.mHub, craft.hub.r_BcB_B = 1000.0, column([0, 0, 0])
-    craft.hub.IHubPntBc_B = np.array(scenario.J).tolist()
-    craft.hub.r_CN_NInit, craft.hub.v_CN_NInit = column([0, 0, -far]), column([rate * far, 0, 0])
-    craft.hub.sigma_BNInit, craft.hub.omega_BN_BInit = column(mrp_from_quat(scenario.q)), column(scenario.w)
-    gradient = add(GravityGradientEffector.GravityGradientEffector(), "gradient")
-    gradient.addPlanetName(earth.planetName)
-    craft.addDynamicEffector(gradient)
-    # sensors
-    gyro = add(imuSensor.ImuSensor(), "gyro")
-    gyro.scStateInMsg.subscribeTo(craft.scStateOutMsg)
-    trackers = [add(starTracker.StarTracker(), f"tracker {i}") for i in range(2)]
-    for tracker in trackers:
-        tracker.scStateInMsg.subscribeTo(craft.scStateOutMsg)
+    rate = float(scenario.orbit_rate)
     stars = [Vec3(*(float(a[i]) for a in scenario.stars)) for i in range(2)]
 
-    def read():
+    def satellite():
+        """Spacecraft, gyro, both trackers and the message of the torque; at the start x is ahead and z down."""
+        craft = add(spacecraft.Spacecraft(), "craft", 5)
+        bodies = simIncludeGravBody.gravBodyFactory()
+        earth = bodies.createEarth()
+        earth.isCentralBody = True
+        bodies.addBodiesTo(craft)
+        keep.append(bodies)
+        far = float(np.cbrt(earth.mu / rate**2))
+        craft.hub.mHub, craft.hub.r_BcB_B = 1000.0, column([0, 0, 0])
+        craft.hub.IHubPntBc_B = np.array(scenario.J).tolist()
+        craft.hub.r_CN_NInit, craft.hub.v_CN_NInit = column([0, 0, -far]), column([rate * far, 0, 0])
+        craft.hub.sigma_BNInit, craft.hub.omega_BN_BInit = column(mrp_from_quat(scenario.q)), column(scenario.w)
+        gradient = add(GravityGradientEffector.GravityGradientEffector(), "gradient", 4)
+        gradient.addPlanetName(earth.planetName)
+        craft.addDynamicEffector(gradient)
+        gyro = add(imuSensor.ImuSensor(), "gyro", 3)
+        trackers = [add(starTracker.StarTracker(), "tracker", 3) for _ in range(2)]
+        for sensor in (gyro, *trackers):
+            sensor.scStateInMsg.subscribeTo(craft.scStateOutMsg)
+        torque, push = messaging.CmdTorqueBodyMsg(), add(extForceTorque.ExtForceTorque(), "push", 1)
+        push.cmdTorqueInMsg.subscribeTo(torque)
+        push.extTorquePntB_B = column(scenario.torque)
+        craft.addDynamicEffector(push)
+        return craft, gyro, trackers, torque
+
+    fleet = [satellite() for _ in range(n)]
+
+    def one(craft, gyro, trackers, _):
         state, rates, first = craft.scStateOutMsg.read(), gyro.sensorOutMsg.read(), len(computer.told) == 0
         half = 0.5 * atan2(state.r_BN_N[0], -state.r_BN_N[2])
         against = quat_conjugate(Quat(cos(half), 0.0, -sin(half), 0.0))  # of the orbit's frame
@@ -114,24 +128,25 @@ def flight(scenario, seconds: float, seed: int = 0):
             Vec3(*state.omega_BN_B),
         )
 
-    # on board
-    torque = messaging.CmdTorqueBodyMsg()
-    payload = lambda u: messaging.CmdTorqueBodyMsgPayload(torqueRequestBody=np.array(u).tolist())
+    def read():
+        return jax.tree.map(lambda *a: np.stack(a), *(one(*parts) for parts in fleet))
+
+    def write(_, told):
+        torques = np.stack(told.u, axis=1).tolist()
+        payload = lambda u: messaging.CmdTorqueBodyMsgPayload(torqueRequestBody=u)
+        return [(message, payload(u)) for (*_, message), u in zip(fleet, torques)]
+
     start = loop.computer_of(*loop.init(LMMSE, 1, PARAMS, scenario))
-    write = lambda _, told: [(torque, payload(told.u))]
-    computer = add(basilisk.computer(decide, PARAMS, start, dt=loop.DT, read=read, write=write), "computer")
-    # actuators
-    push = add(extForceTorque.ExtForceTorque(), "push")
-    push.cmdTorqueInMsg.subscribeTo(torque)
-    push.extTorquePntB_B = column(scenario.torque)
-    craft.addDynamicEffector(push)
+    start = jax.tree.map(lambda a: np.broadcast_to(a, (n, *np.shape(a))), start)
+    computer = basilisk.computer(many, PARAMS, start, dt=loop.DT, read=read, write=write)
+    add(computer, "computer", 2)
     sim.InitializeSimulation()
     fault = scenario.gyro.x
     for until in (min(fault.onset, seconds), seconds):  # the tick of the onset is the first with the bias
-        if until > 0:
-            sim.ConfigureStopTime(macros.sec2nano(until - loop.DT))
-            sim.ExecuteSimulation()
-        gyro.senRotBias = [fault.bias, 0.0, 0.0]
+        sim.ConfigureStopTime(macros.sec2nano(until - loop.DT))
+        sim.ExecuteSimulation()
+        for _, gyro, _, _ in fleet:
+            gyro.senRotBias = [fault.bias, 0.0, 0.0]
     return computer.record()
 
 
@@ -141,7 +156,7 @@ def differences(seconds: float, onset: float) -> tuple[dict[str, float], int]:
     And how many alarms of the two filters there are.
     """
     scenario = scenario_of(onset, BIAS, noisy=False)
-    _, _, told = flight(scenario, seconds)
+    told = jax.tree.map(lambda a: a[:, 0], flights(scenario, seconds)[2])
     log = simulate(loop.system, PARAMS, scenario, jax.random.key(0), ticks=round(seconds / loop.DT))
     far = lambda a, b: max(float(np.abs(np.array(x) - np.array(y)).max()) for x, y in zip(a, b, strict=True))
     verdict = told.verdict
@@ -157,18 +172,15 @@ def differences(seconds: float, onset: float) -> tuple[dict[str, float], int]:
     return found, int(verdict.alarm.sum())
 
 
-def detected(runs: int, seconds: float = END) -> int:
-    """Of so many noisy flights in Basilisk, how many alarm from the onset on."""
-    scenario, hits = scenario_of(ONSET, BIAS), 0
-    for seed in range(runs):
-        t, _, told = flight(scenario, seconds, seed)
-        hits += bool(told.verdict.alarm[t >= ONSET - loop.DT / 2].any())
-    return hits
+def detected(n: int) -> int:
+    """Of n noisy flights in Basilisk, how many alarm from the onset on."""
+    t, _, told = flights(scenario_of(ONSET, BIAS), END, n)
+    return int(told.verdict.alarm[t >= ONSET - loop.DT / 2].any(axis=(0, 2)).sum())
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.inside_basilisk", description=__doc__)
-    parser.add_argument("--runs", type=int, default=100, help="noisy flights in Basilisk; ten times as many of ours")
+    parser.add_argument("--runs", type=int, default=200, help="noisy flights in Basilisk; ten times as many of ours")
     args = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     jaxatt.configure()
