@@ -187,7 +187,7 @@ def main() -> None:
     print("One flight of 120 s without noise, the gyro biased from 60 s on, float64")
     found, alarms = differences(120.0, 60.0)
     good = alarms > 0
-    print(f"  {'alarms':44}{alarms:12}")
+    print(f"  {'alarms':44}{alarms:12}", flush=True)
     for name, worst in found.items():
         good &= worst <= LIMIT
         print(f"  {name + ', largest difference' if '[' in name else name:44}{worst:12.2e}")
