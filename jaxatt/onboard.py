@@ -19,9 +19,7 @@ from jax import export
 class OnBoard(NamedTuple):
     """Code, numbers by name, and what both mean."""
 
-    decide: (
-        Callable  # (k, params, computer, readings) of tick k to the computer of tick k + 1 and the log: dicts by name
-    )
+    decide: Callable  # (k, params, computer, readings) of tick k -> computer of tick k + 1, log: dicts by name
     params: dict  # as they were shipped
     computer: dict  # before tick 0
     about: dict  # `dt` [s], and unit, shape and type of each number
@@ -36,7 +34,7 @@ def load(path) -> OnBoard:
             params, computer = ({n: numbers[f"{kind}/{n}"] for n in about[kind]} for kind in ("params", "computer"))
     if about["float"] == "float64" and not jax.config.read("jax_enable_x64"):
         raise ValueError(
-            "`path` must hold float32, but it is float64: jax.config.update('jax_enable_x64', True) first."
+            "`path` must hold float32, but it is float64: first jax.config.update('jax_enable_x64', True)."
         )
     call = jax.jit(code.call)
 

@@ -50,7 +50,7 @@ def readings() -> AttitudeRate:
 def test_a_file_gives_the_bits_of_decide_where_there_is_no_jaxatt(tmp_path):
     told = readings()
     at = lambda k: jax.tree.map(lambda a: a[k], told)
-    flown = dict(dt=loop.DT, flow=loop.computer_flow, substeps=loop.system.substeps)
+    flown: dict[str, Any] = dict(dt=loop.DT, flow=loop.computer_flow, substeps=loop.system.substeps)
     path = exporting.write(tmp_path / "computer.zip", loop.decide, loop.params, COMPUTER, at(0), **flown)
     np.savez(tmp_path / "told.npz", **fields.named(told, "readings"))
     run = [sys.executable, "-c", ALONE, str(path), str(tmp_path / "told.npz"), str(tmp_path / "said.npz")]

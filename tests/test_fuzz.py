@@ -49,7 +49,7 @@ MEETING = [
 ]
 # public for the modules of the house: what they get has been checked before
 HOUSE = {
-    "sweeping": "block_log block_of block_records block_scores logged progress_bar score_shapes scored scores_of",
+    "sweeping": "block_log block_of block_records block_scores by_block logged progress_bar recorded score_shapes scored scores_of",
     "design_point": "sloped",
     "loss": "log_t said wilson",
     "reliability": "score_slopes",
