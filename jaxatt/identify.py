@@ -37,6 +37,7 @@ from jaxatt.noise import one_key
 from jaxatt.sweeping import progress_bar
 
 ENOUGH = 1e-6  # [nats] that a step of the search is expected to gain, at which it ends
+ROUND = 12  # steps after which the search takes a new Hessian
 SETTLED = 1e-3  # [nats] that a Newton step may still gain of a fit that counts as converged: .04 standard deviations
 LEVEL = 1.959963985  # standard deviations to either side of a 95 % interval
 SMALL = 0.1  # share of a direction's largest number below which a number is left out of the words
@@ -225,17 +226,11 @@ def _ways(u):
 
 
 def _slopes(case: _Case, u, *data):
-    """nll (n,), its gradient (n, p), and the sum over ticks of the products of their gradients (n, p, p)."""
-    nll = lambda u: _nll(case, u, *data)[0]
-    value, slopes = jax.vmap(lambda way: jax.jvp(nll, (u,), (way,)), out_axes=(None, 0))(_ways(u))
-    return jnp.sum(value, 1), jnp.sum(slopes, 2).T, jnp.einsum("int,jnt->nij", slopes, slopes)
-
-
-def _hessian(case: _Case, u, *data):
-    """The Hessian of nll (n, p, p), forward over forward."""
-    gradient = lambda u: _slopes(case, u, *data)[1]
-    rows = jax.vmap(lambda way: jax.jvp(gradient, (u,), (way,))[1])(_ways(u))
-    return jnp.swapaxes(rows, 0, 1)
+    """nll (n,), its gradient (n, p), the sum over ticks of the products of their gradients (n, p, p), measurements (n,)."""
+    along = lambda way: jax.jvp(lambda u: _nll(case, u, *data), (u,), (way,), has_aux=True)
+    value, slopes, rows = jax.vmap(along, out_axes=(None, 0, None))(_ways(u))
+    products = jnp.einsum("int,jnt->nij", slopes, slopes)
+    return jnp.sum(value, 1), jnp.sum(slopes, 2).T, products, jnp.sum(rows, 1)
 
 
 class _Problem(NamedTuple):
@@ -249,7 +244,7 @@ class _Problem(NamedTuple):
     names: tuple[str, ...]  # of the numbers of theta
 
     def call(self, f: Callable, u):
-        """f of `_nll`, `_slopes`, `_hessian` at u (n, p), or (1, p) for all flights, as NumPy arrays."""
+        """f, `_nll` or `_slopes`, at u (n, p), or (1, p) for all flights, as NumPy arrays."""
         u = np.broadcast_to(u, (self.n, u.shape[1]))
         operands = u, self.start, self.spread, self.flights
         return jax.tree.map(np.asarray, compiled(f, 1, *operands)(self.case, *operands))
@@ -310,12 +305,16 @@ def _problem(model, build, start, flights, spread) -> _Problem:
     start = row(leaves)
     fields.validate("build(start)", build(case.tree(start)))
     problem = _Problem(case, start, row(wide), jax.tree.map(exact, flights), n, tuple(names))
-    nll, rows = (a.sum(1) for a in problem.call(_nll, np.zeros((1, len(start)))))
-    empty, bad = rows <= 0, ~np.isfinite(nll)
+    nll, slope, _, rows = problem.call(_slopes, np.zeros((1, len(start))))
+    empty, bad = rows <= 0, ~(np.isfinite(nll) & np.isfinite(slope).all(1))
     if empty.any():
         check.refuse("flights", "hold a finite innovation in every flight", f"without one in flight {np.argmax(empty)}")
     if bad.any():
-        check.refuse("start", "have a finite likelihood in every flight", f"{nll[bad][0]} in flight {np.argmax(bad)}")
+        check.refuse(
+            "start",
+            "have a finite likelihood and gradient in every flight",
+            f"{nll[bad][0]:g} in flight {np.argmax(bad)}",
+        )
     return problem
 
 
@@ -328,9 +327,9 @@ def fit(
 ) -> Fit:  # fmt: skip
     """The numbers theta that make the innovations of recorded flights most likely, and what is known of them.
 
-    The search is L-BFGS, preconditioned by the products of the gradients of the ticks (Berndt et al., 1974), whose sum is the
-    information matrix where the model is right. Intervals are Laplace's, by the Hessian at the end; ``robust`` ones by the
-    sandwich of both matrices (White, 1982). Directions in which the data tell less than the spread are named.
+    The search is L-BFGS, preconditioned by the Hessian at its start and after every `ROUND` steps. Intervals are Laplace's, by
+    the Hessian at the end; ``robust`` ones by the sandwich of it and the products of the gradients of the ticks (White, 1982).
+    Directions in which the data tell less than the spread are named.
 
     Args:
         model: on-board code and its innovations.
@@ -357,33 +356,38 @@ def fit(
     with jax.enable_x64(True):
         problem = _problem(model, build, start, flights, spread)
         u = np.zeros((problem.n if each else 1, len(problem.start)))
-        metric = None
+        value, slope, products, _ = problem.summed(_slopes, u)
+        hessian = _hessian(problem, u, products)
         with progress_bar(progress, steps, " steps") as bar:
-            for _ in range(3):
-                u, (value, slope, products), used = _search(problem, u, metric, steps, bar)
+            while True:
+                u, (value, slope, products), used = _search(problem, u, _metric(hessian), min(steps, ROUND), bar)
                 steps -= used
-                hessian = problem.summed(_hessian, u) + np.eye(u.shape[1])
-                sizes, ways = np.linalg.eigh(hessian)
-                metric = np.einsum("nij,nj,nkj->nik", ways, np.maximum(np.abs(sizes), 1), ways)
-                gap = 0.5 * np.einsum("ni,nij,nj->n", slope, np.linalg.inv(metric), slope)
-                sound = (sizes[:, 0] > 0) & (gap < SETTLED)
+                hessian = _hessian(problem, u, products)
+                gap = 0.5 * np.einsum("ni,nij,nj->n", slope, np.linalg.inv(_metric(hessian)), slope)
+                sound = (np.linalg.eigvalsh(hessian)[:, 0] > 0) & (gap < SETTLED)
                 if sound.all() or steps <= 0:
                     break
         return _told(problem, u, value, products, hessian, gap, sound, each)
 
 
+def _metric(hessian):
+    """The Hessian (g, p, p) with its eigenvalues made positive, at least the prior's."""
+    sizes, ways = np.linalg.eigh(hessian)
+    return np.einsum("nij,nj,nkj->nik", ways, np.maximum(np.abs(sizes), 1), ways)
+
+
 def _search(problem: _Problem, u, metric, steps: int, bar):
-    """L-BFGS with backtracking from u (g, p), each row for itself; metric (g, p, p) None: the products of the gradients.
+    """L-BFGS with backtracking from u (g, p), each row for itself, preconditioned by the metric (g, p, p).
 
     Returns u, the value, gradient and products there, and how many steps were taken.
     """
 
     def evaluate(u):
-        value, slope, products = problem.summed(_slopes, u)
+        value, slope, products, _ = problem.summed(_slopes, u)
         return value + 0.5 * np.sum(u * u, 1), slope + u, products
 
     found = evaluate(u)
-    root = np.linalg.cholesky(found[2] + np.eye(u.shape[1]) if metric is None else metric)  # L of u = L'^-1 w
+    root = np.linalg.cholesky(metric)  # L of u = L'^-1 w
     out = lambda w: np.linalg.solve(np.swapaxes(root, 1, 2), w[..., None])[..., 0]
     into = lambda slope: np.linalg.solve(root, slope[..., None])[..., 0]
     w = np.einsum("nji,nj->ni", root, u)
@@ -417,6 +421,23 @@ def _search(problem: _Problem, u, metric, steps: int, bar):
     return out(w), found, taken
 
 
+def _hessian(problem: _Problem, u, products):
+    """The Hessian of nll and prior (g, p, p): central differences of the exact gradient along axes of one deviation each.
+
+    A second derivative of a filter by the compiler takes as long to compile as all else; these differences, a thousandth of
+    a deviation wide, are off by some 1e-6 of it.
+    """
+    p = u.shape[1]
+    root = np.linalg.cholesky(products + np.eye(p))
+    step = 1e-3 * np.swapaxes(np.linalg.inv(root), 1, 2)  # columns: u = L'^-1 w
+    rows = []
+    for i in range(p):
+        ahead, behind = (problem.summed(_slopes, u + sign * step[:, :, i])[1] for sign in (1, -1))
+        rows.append((ahead - behind) / 2e-3)
+    slopes = root @ np.stack(rows, 1)  # of rows L^-1 H
+    return 0.5 * (slopes + np.swapaxes(slopes, 1, 2)) + np.eye(p)
+
+
 def _chosen(which, a, b):
     """Rows of the trees a where ``which``, of b elsewhere."""
     return jax.tree.map(lambda a, b: jnp.where(which.reshape(-1, *(1,) * (jnp.ndim(a) - 1)), a, b), a, b)
@@ -429,7 +450,9 @@ def _told(problem: _Problem, u, value, products, hessian, gap, sound, each: bool
     inverse = np.linalg.inv(np.where((sizes[:, 0] > 0)[:, None, None], hessian, np.nan * np.eye(p)))
     middle = inverse @ (products + np.eye(p)) @ inverse
     row, (std, robust) = problem.start + spread * u, (_deviations(a) * spread for a in (inverse, middle))
-    blind = [_blind(a - np.eye(p), problem.names, spread) for a in hessian]
+    blind = [
+        _blind(a - np.eye(p) if ok else np.full((p, p), np.inf), problem.names, spread) for a, ok in zip(hessian, sound)
+    ]
     trees = [jax.vmap(problem.case.tree)(a) for a in (row, std, row - LEVEL * std, row + LEVEL * std, robust)]
     theta, std, low, high, robust = jax.tree.map(np.asarray, trees)
     words, ways = tuple(words for words, _ in blind), tuple(ways for _, ways in blind)
@@ -457,6 +480,8 @@ def _deviations(covariance):
 
 def _blind(hessian, names, spread) -> tuple[tuple[str, ...], np.ndarray]:
     """Sentences on the directions in which the likelihood's Hessian, in units of the spread, is below 1; they, in theta's units."""
+    if not np.isfinite(hessian).all():  # of a search that did not end
+        return (), np.zeros((0, len(names)))
     sizes, ways = np.linalg.eigh(hessian)
     basis = _plain(ways[:, sizes < 1].T)
     return tuple(_sentence(way, names, spread) for way in basis), basis * spread
@@ -624,7 +649,7 @@ def posterior(
 
         def slopes(x, data):
             u = at + root @ x
-            value, slope, _ = _slopes(problem.case, jnp.broadcast_to(u, (problem.n, *u.shape)), *data)
+            value, slope, *_ = _slopes(problem.case, jnp.broadcast_to(u, (problem.n, *u.shape)), *data)
             return -jnp.sum(value) - 0.5 * u @ u, -root.T @ (jnp.sum(slope, 0) + u)
 
         def density(data):
