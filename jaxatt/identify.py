@@ -527,19 +527,24 @@ def report(found: Fit) -> str:
         >>> print(report(fit(model, build, start, flights, spread=spread)))
     """
     check.kind("found", found, Fit)
-    if np.ndim(found.nll):
+    trees = found.theta, found.std, found.robust, found.low, found.high
+    parts = [fields.named(check.numbers("found", tree), "theta") for tree in trees]
+    shapes = {tuple((name, np.shape(a)) for name, a in part.items()) for part in parts}
+    words = isinstance(found.blind, tuple) and all(isinstance(said, str) for said in found.blind)
+    if len(shapes) > 1 or not words or np.ndim(found.nll) or np.ndim(found.converged):
         raise TypeError(
             "`found` must be a fit of all flights together, but it is one of each flight: take one of them."
         )
     lines = [f"{'number':24} {'estimate':>12} {'std':>10} {'robust':>10}  95 % interval"]
-    parts = [fields.named(tree, "theta") for tree in (found.theta, found.std, found.robust, found.low, found.high)]
     for name in parts[0]:
         for i, row in enumerate(zip(*(np.ravel(part[name]) for part in parts))):
             value, std, robust, low, high = row
             label = f"{name}.{i}" if np.ndim(parts[0][name]) else name
             lines.append(f"{label:24} {value:12.6g} {std:10.3g} {robust:10.3g}  {low:.6g} to {high:.6g}")
     if not found.converged:
-        lines.append(f"not converged: a step would still gain {found.gap:.3g} nats, or the end is no minimum")
+        lines.append(
+            f"not converged: a step would still gain {check.number('found.gap', found.gap):.3g} nats, or the end is no minimum"
+        )
     return "\n".join(lines + [f"{said[0].upper()}{said[1:]}." for said in found.blind])
 
 

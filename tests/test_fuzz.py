@@ -11,6 +11,7 @@ import jax
 import numpy as np
 import pytest
 import test_fuzz_files
+import test_fuzz_identify
 import test_fuzz_rare
 import test_fuzz_verbs
 from abuse import EXAMPLES, fuzzed, good, judged, odd, plain, tidy
@@ -34,6 +35,7 @@ MEETING = [
     "design_point",
     "evaluation",
     "exporting",
+    "identify",
     "loss",
     "plot",
     "pointing",
@@ -51,6 +53,7 @@ MEETING = [
 HOUSE = {
     "sweeping": "block_log block_of block_records block_scores by_block logged progress_bar recorded score_shapes scored scores_of",
     "design_point": "sloped",
+    "identify": "likelihood surprise posterior",
     "loss": "log_t said wilson",
     "reliability": "score_slopes",
 }
@@ -66,7 +69,7 @@ def public(module):
 
 @pytest.mark.parametrize("name", MEETING)
 def test_every_public_function_that_meets_data_is_abused(name):
-    here = [f for module in (test_fuzz_files, test_fuzz_verbs) for f in vars(module).values()]
+    here = [f for module in (test_fuzz_files, test_fuzz_verbs, test_fuzz_identify) for f in vars(module).values()]
     abused = {inspect.unwrap(f) for f in here if inspect.isfunction(f)}
     abused |= {inspect.unwrap(getattr(plot, figure)) for figure in test_fuzz_verbs.FIGURES}
     abused |= {getattr(rare, verb) for verb in test_fuzz_rare.VERBS}
