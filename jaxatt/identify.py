@@ -39,6 +39,8 @@ from jaxatt.sweeping import progress_bar
 ENOUGH = 1e-6  # [nats] that a step of the search is expected to gain, at which it ends
 ROUND = 12  # steps after which the search takes a new Hessian
 SETTLED = 1e-3  # [nats] that a Newton step may still gain of a fit that counts as converged: .04 standard deviations
+WIDEST = 3.0  # spreads that a step may move any number
+STEP = 1e-3  # deviations to either side in the differences of the Hessian
 LEVEL = 1.959963985  # standard deviations to either side of a 95 % interval
 SMALL = 0.1  # share of a direction's largest number below which a number is left out of the words
 
@@ -203,9 +205,9 @@ class _Case(NamedTuple):
     shapes: tuple
 
     def tree(self, flat):
-        """theta of its numbers in a row."""
+        """theta of its numbers in a row, the last axis."""
         ends = np.cumsum([0, *(int(np.prod(shape)) for shape in self.shapes)])
-        parts = [flat[a:b].reshape(shape) for a, b, shape in zip(ends, ends[1:], self.shapes)]
+        parts = [flat[..., a:b].reshape((*flat.shape[:-1], *shape)) for a, b, shape in zip(ends, ends[1:], self.shapes)]
         return jax.tree.unflatten(self.structure, parts)
 
 
@@ -305,8 +307,8 @@ def _problem(model, build, start, flights, spread) -> _Problem:
     start = row(leaves)
     fields.validate("build(start)", build(case.tree(start)))
     problem = _Problem(case, start, row(wide), jax.tree.map(exact, flights), n, tuple(names))
-    nll, slope, _, rows = problem.call(_slopes, np.zeros((1, len(start))))
-    empty, bad = rows <= 0, ~(np.isfinite(nll) & np.isfinite(slope).all(1))
+    nll, slope, products, rows = problem.call(_slopes, np.zeros((1, len(start))))
+    empty, bad = rows <= 0, ~(np.isfinite(nll) & np.isfinite(slope).all(1) & np.isfinite(products).all((1, 2)))
     if empty.any():
         check.refuse("flights", "hold a finite innovation in every flight", f"without one in flight {np.argmax(empty)}")
     if bad.any():
@@ -356,28 +358,43 @@ def fit(
     with jax.enable_x64(True):
         problem = _problem(model, build, start, flights, spread)
         u = np.zeros((problem.n if each else 1, len(problem.start)))
-        value, slope, products, _ = problem.summed(_slopes, u)
-        hessian = _hessian(problem, u, products)
+        hessian = _hessian(problem, u, problem.summed(_slopes, u)[2])
         with progress_bar(progress, steps, " steps") as bar:
             while True:
-                u, (value, slope, products), used = _search(problem, u, _metric(hessian), min(steps, ROUND), bar)
+                u, (value, slope, products), used = _search(problem, u, _axes(hessian), min(steps, ROUND), bar)
                 steps -= used
                 hessian = _hessian(problem, u, products)
-                gap = 0.5 * np.einsum("ni,nij,nj->n", slope, np.linalg.inv(_metric(hessian)), slope)
+                gap = 0.5 * np.sum(np.einsum("nij,ni->nj", _axes(hessian), slope) ** 2, 1)
                 sound = (np.linalg.eigvalsh(hessian)[:, 0] > 0) & (gap < SETTLED)
-                if sound.all() or steps <= 0:
+                if sound.all() or steps <= 0 or not used:
                     break
         return _told(problem, u, value, products, hessian, gap, sound, each)
 
 
-def _metric(hessian):
-    """The Hessian (g, p, p) with its eigenvalues made positive, at least the prior's."""
-    sizes, ways = np.linalg.eigh(hessian)
-    return np.einsum("nij,nj,nkj->nik", ways, np.maximum(np.abs(sizes), 1), ways)
+def _axes(matrix):
+    """Columns A (g, p, p) with A' M A = I, the eigenvalues of M (g, p, p) made positive and at least the prior's, 1."""
+    sizes, ways = np.linalg.eigh(matrix)
+    return ways / np.sqrt(np.maximum(np.abs(sizes), 1))[:, None]
 
 
-def _search(problem: _Problem, u, metric, steps: int, bar):
-    """L-BFGS with backtracking from u (g, p), each row for itself, preconditioned by the metric (g, p, p).
+def _hessian(problem: _Problem, u, products):
+    """The Hessian of nll and prior (g, p, p): central differences of the exact gradient along axes of one deviation each.
+
+    A second derivative of a filter takes the compiler as long as all else; these differences, a thousandth of a deviation wide,
+    are off by some 1e-6 of it. Minus one where the likelihood is not finite so near by.
+    """
+    p, axes = u.shape[1], _axes(products + np.eye(u.shape[1]))
+    columns = []
+    for i in range(p):
+        ahead, behind = (problem.summed(_slopes, u + sign * STEP * axes[:, :, i])[1] for sign in (1, -1))
+        columns.append((ahead - behind) / (2 * STEP))
+    hessian = np.stack(columns, 2) @ np.linalg.inv(axes)
+    finite = np.isfinite(hessian).all((1, 2), keepdims=True)
+    return np.where(finite, 0.5 * (hessian + np.swapaxes(hessian, 1, 2)) + np.eye(p), -np.eye(p))
+
+
+def _search(problem: _Problem, u, axes, steps: int, bar):
+    """L-BFGS with backtracking from u (g, p), each row for itself, in the coordinates w of u + axes w.
 
     Returns u, the value, gradient and products there, and how many steps were taken.
     """
@@ -386,61 +403,44 @@ def _search(problem: _Problem, u, metric, steps: int, bar):
         value, slope, products, _ = problem.summed(_slopes, u)
         return value + 0.5 * np.sum(u * u, 1), slope + u, products
 
-    found = evaluate(u)
-    root = np.linalg.cholesky(metric)  # L of u = L'^-1 w
-    out = lambda w: np.linalg.solve(np.swapaxes(root, 1, 2), w[..., None])[..., 0]
-    into = lambda slope: np.linalg.solve(root, slope[..., None])[..., 0]
-    w = np.einsum("nji,nj->ni", root, u)
-    lbfgs = optax.scale_by_lbfgs()
-    state, length = jax.vmap(lbfgs.init)(jnp.asarray(w)), np.ones(len(u))
-    rule = jax.jit(jax.vmap(lbfgs.update))
-    fresh, taken = np.ones(len(u), bool), 0
-    way = np.zeros_like(w)
+    begin, w, found = u, np.zeros_like(u), evaluate(u)
+    at = lambda w: np.einsum("nij,nj->ni", axes, w)
+    state = jax.tree.map(np.asarray, jax.vmap(_LBFGS.init)(w))
+    length, way, fresh, taken = np.ones(len(u)), np.zeros_like(u), np.ones(len(u), bool), 0
     for taken in range(steps + 1):
-        slope = into(found[1])
-        pushed, ahead = rule(jnp.asarray(slope), state, jnp.asarray(w))
-        state = _chosen(fresh, ahead, state)
-        way = np.where(fresh[:, None], -np.asarray(pushed), way)
-        uphill = fresh & ~(np.sum(slope * way, 1) < 0)
-        way[uphill] = -slope[uphill]
+        slope = np.einsum("nij,ni->nj", axes, found[1])
+        against, ahead = jax.tree.map(np.asarray, compiled(_turned, 0, slope)(slope, state, w))
+        state, way = _chosen(fresh, (ahead, -against), (state, way))
+        way = _chosen(fresh & ~(np.sum(slope * way, 1) < 0), -slope, way)  # uphill
         gain = -np.sum(slope * way, 1)
-        far = np.abs(out(way)).max(1)
-        length = np.where(fresh, np.minimum(1, 3 / np.maximum(far, 1e-300)), length)  # at most three spreads
+        widest = np.maximum(np.abs(at(way)).max(1), np.finfo(float).tiny)
+        length = np.where(fresh, np.minimum(1, WIDEST / widest), length)
         busy = (gain > 2 * ENOUGH) & (length > 1e-8)
-        if not busy.any() or taken == steps:
+        if taken == steps or not busy.any():
             break
-        trial = np.where(busy[:, None], w + length[:, None] * way, w)
-        there = evaluate(out(trial))
-        good = np.isfinite(there[0]) & np.isfinite(there[1]).all(1) & (there[0] <= found[0] - 1e-4 * length * gain)
-        fresh = busy & good
-        w = np.where(fresh[:, None], trial, w)
-        found = jax.tree.map(np.asarray, _chosen(fresh, there, found))
-        length = np.where(busy & ~good, 0.3 * length, length)
+        trial = _chosen(busy, w + length[:, None] * way, w)
+        there = evaluate(begin + at(trial))
+        good = np.isfinite(there[0]) & np.isfinite(there[1]).all(1) & np.isfinite(there[2]).all((1, 2))
+        with np.errstate(invalid="ignore"):
+            fresh = busy & good & (there[0] <= found[0] - 1e-4 * length * gain)
+        w, found = _chosen(fresh, (trial, there), (w, found))
+        length = np.where(busy & ~fresh, 0.3 * length, length)
         bar.set_postfix_str(f"{busy.sum()} of {len(u)} to go, nll {found[0].sum():.6g}")
         bar.update()
-    return out(w), found, taken
+    return begin + at(w), found, taken
 
 
-def _hessian(problem: _Problem, u, products):
-    """The Hessian of nll and prior (g, p, p): central differences of the exact gradient along axes of one deviation each.
+_LBFGS = optax.scale_by_lbfgs(scale_init_precond=False)  # the first step is Newton's
 
-    A second derivative of a filter by the compiler takes as long to compile as all else; these differences, a thousandth of
-    a deviation wide, are off by some 1e-6 of it.
-    """
-    p = u.shape[1]
-    root = np.linalg.cholesky(products + np.eye(p))
-    step = 1e-3 * np.swapaxes(np.linalg.inv(root), 1, 2)  # columns: u = L'^-1 w
-    rows = []
-    for i in range(p):
-        ahead, behind = (problem.summed(_slopes, u + sign * step[:, :, i])[1] for sign in (1, -1))
-        rows.append((ahead - behind) / 2e-3)
-    slopes = root @ np.stack(rows, 1)  # of rows L^-1 H
-    return 0.5 * (slopes + np.swapaxes(slopes, 1, 2)) + np.eye(p)
+
+def _turned(slope, state, w):
+    """The direction of L-BFGS and its next state, row by row."""
+    return jax.vmap(_LBFGS.update)(slope, state, w)
 
 
 def _chosen(which, a, b):
     """Rows of the trees a where ``which``, of b elsewhere."""
-    return jax.tree.map(lambda a, b: jnp.where(which.reshape(-1, *(1,) * (jnp.ndim(a) - 1)), a, b), a, b)
+    return jax.tree.map(lambda a, b: np.where(which.reshape(-1, *(1,) * (np.ndim(a) - 1)), a, b), a, b)
 
 
 def _told(problem: _Problem, u, value, products, hessian, gap, sound, each: bool) -> Fit:
@@ -453,8 +453,7 @@ def _told(problem: _Problem, u, value, products, hessian, gap, sound, each: bool
     blind = [
         _blind(a - np.eye(p) if ok else np.full((p, p), np.inf), problem.names, spread) for a, ok in zip(hessian, sound)
     ]
-    trees = [jax.vmap(problem.case.tree)(a) for a in (row, std, row - LEVEL * std, row + LEVEL * std, robust)]
-    theta, std, low, high, robust = jax.tree.map(np.asarray, trees)
+    theta, std, low, high, robust = map(problem.case.tree, (row, std, row - LEVEL * std, row + LEVEL * std, robust))
     words, ways = tuple(words for words, _ in blind), tuple(ways for _, ways in blind)
     found = Fit(
         theta,
@@ -684,4 +683,4 @@ def posterior(
         x, divergent = (np.concatenate([np.asarray(part[i]) for part in parts]) for i in (0, 1))
         theta = problem.start + problem.spread * (at + x @ root.T)
         effective = np.asarray(blackjax.diagnostics.effective_sample_size(theta[None]))
-        return Posterior(jax.tree.map(np.asarray, jax.vmap(problem.case.tree)(theta)), divergent.mean(), effective)
+        return Posterior(problem.case.tree(theta), divergent.mean(), effective)

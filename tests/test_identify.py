@@ -248,7 +248,7 @@ def test_bad_input_is_refused_in_one_line():
         (dict(flights=FLIGHTS._replace(computer=Belief(np.zeros(3), np.zeros(3)))), "`flights.computer` must lead with the 40 flights"),
         (dict(flights=identify.Flights((), FLIGHTS.readings[0])), r"`flights.readings` must have shape \(80, T, ...\)"),
         (dict(start=START | dict(log_q=np.nan)), r"`start\['log_q'\]` must be finite"),
-        (dict(start=START | dict(log_q=800.0)), "`start` must have a finite likelihood and gradient in every flight"),
+        (dict(start=START | dict(decay=1e200)), "`start` must have a finite likelihood and gradient in every flight"),
         (dict(build=negative), r"`build\(start\).q` must be a positive number, but it is 0"),
         (dict(spread=dict(decay=1.0)), r"`spread` must be one number, or hold those of start \(decay, log_q, log_r\), but it is decay"),
         (dict(spread=SPREAD | dict(log_q=0.0)), r"`spread\['log_q'\]` must be a positive number"),
