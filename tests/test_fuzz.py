@@ -36,6 +36,7 @@ MEETING = [
     "evaluation",
     "exporting",
     "identify",
+    "innovations",
     "loss",
     "plot",
     "pointing",
@@ -53,7 +54,8 @@ MEETING = [
 HOUSE = {
     "sweeping": "block_log block_of block_records block_scores by_block logged progress_bar recorded score_shapes scored scores_of",
     "design_point": "sloped",
-    "identify": "likelihood surprise posterior",
+    "identify": "posterior",
+    "innovations": "likelihood surprise",
     "loss": "log_t said wilson",
     "reliability": "score_slopes",
 }
