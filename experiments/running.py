@@ -39,7 +39,7 @@ EXPERIMENTS = {
     "microsat": Experiment(90, 61, "reconfiguration"),
     "rare_events": Experiment(45, 16, "curves"),
     "yardstick": Experiment(140, 46, "board"),
-    "identify": Experiment(30, 8, "walk"),
+    "identify": Experiment(30, 6, "walk"),
 }
 NAMES = tuple(EXPERIMENTS)
 LOOPS = tuple(name for name in NAMES if find_spec(f"jaxatt.loops.{name}"))  # which have studies and a campaign
