@@ -131,7 +131,8 @@ def _problem(model, build, start, flights, spread) -> _Problem:
     check.kind("model", model, Model)
     check.function("model.decide", model.decide)
     check.function("model.innovations", model.innovations)
-    check.positive("model.dt", check.number("model.dt", model.dt))
+    model = model._replace(dt=check.number("model.dt", model.dt))  # hashable
+    check.positive("model.dt", model.dt)
     check.function("build", build)
     check.kind("flights", flights, Flights)
     for name, tree in zip(("flights.computer", "flights.readings"), flights):
