@@ -508,7 +508,7 @@ def posterior(
     """
     draws, warmup, key = check.whole("draws", draws), check.whole("warmup", warmup), one_key(key)
     try:
-        import blackjax
+        import blackjax  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise ImportError("`posterior` needs blackjax: pip install 'jaxatt[posterior]'") from error
     found = fit(model, build, start, flights, spread=spread, progress=progress)

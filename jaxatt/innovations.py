@@ -63,24 +63,17 @@ def put(params, numbers: Mapping[str, Any]):
     return params
 
 
-def _put(tree, path: list[str], value, name: str):
+def _put(tree: Any, path: list[str], value, name: str):
     here, *rest = path
-    known = (
-        list(tree._fields)
-        if hasattr(tree, "_fields")
-        else [str(i) for i in range(len(tree))]
-        if isinstance(tree, tuple)
-        else []
-    )
+    of_tuple = map(str, range(len(tree))) if isinstance(tree, tuple) else ()
+    known = list(getattr(tree, "_fields", of_tuple))
     if here not in known:
-        near = get_close_matches(here, known, 3) or known
-        check.refuse(
-            "numbers", f"name fields of params (here: {', '.join(near) or 'none, it is a number'})", repr(name)
-        )
+        near = ", ".join(get_close_matches(here, known, 3) or known)
+        check.refuse("numbers", f"name fields of params (here: {near or 'none, it is a number'})", repr(name))
     i = known.index(here)
     new = _put(tree[i], rest, value, name) if rest else value
     parts = [*tree[:i], new, *tree[i + 1 :]]
-    return tree._make(parts) if hasattr(tree, "_fields") else tuple(parts)
+    return type(tree)(*parts) if hasattr(tree, "_fields") else tuple(parts)
 
 
 def likelihood(model: Model, params, computer, readings):
@@ -116,7 +109,7 @@ def likelihood(model: Model, params, computer, readings):
     return jax.lax.scan(tick, jax.tree.map(jnp.asarray, computer), (ticks, readings))[1]
 
 
-def surprise(told):
+def surprise(told) -> tuple[Any, Any]:
     """nll [nats] and number of measurements of what a `Model` calls innovations, both ().
 
     Of a pair (value, covariance): (rows log 2 pi + log det S + nu' S^-1 nu) / 2 over the measurements that are finite.
@@ -125,21 +118,20 @@ def surprise(told):
     """
     if hasattr(told, "nll") and hasattr(told, "rows"):
         return jnp.asarray(told.nll), jnp.asarray(told.rows)
-    if (
-        isinstance(told, tuple)
-        and len(told) == 2
-        and np.ndim(told[0]) == 1
-        and np.shape(told[1]) == np.shape(told[0]) * 2
-    ):
+    pair = isinstance(told, tuple) and len(told) == 2
+    if pair and np.ndim(told[0]) == 1 and np.shape(told[1]) == np.shape(told[0]) * 2:
         return _gaussian(*told)
     if isinstance(told, (list, tuple)) and told:
-        return tuple(sum(parts) for parts in zip(*map(surprise, told)))
+        nll, rows = zip(*map(surprise, told))
+        return sum(nll), sum(rows)
     must = "`innovations` must return an Innovation, a pair of value (k,) and covariance (k, k), or a list of them"
     raise TypeError(f"{must}, but it is {check.short(told)}.")
 
 
 def _gaussian(value, S):
     """nll and number of measurements of value (k,) ~ N(0, S), by elimination of one measurement after the other."""
+    dtype = jnp.promote_types(jnp.result_type(value, S), jnp.float32)  # readings may be counts
+    value, S = (jnp.asarray(a, dtype) for a in (value, S))
     there = jnp.isfinite(value)
 
     def one(i, carry):
@@ -149,5 +141,6 @@ def _gaussian(value, S):
         gain = jnp.where(there[i], S[i] / s, 0)
         return value - gain * value[i], S - gain[:, None] * S[i], nll + 0.5 * jnp.where(there[i], told, 0)
 
-    start = jnp.where(there, value, 0), jnp.asarray(S), jnp.zeros((), jnp.result_type(value, S))
-    return jax.lax.fori_loop(0, len(value), one, start)[2], jnp.sum(there, dtype=start[2].dtype)
+    known = jnp.where(there[:, None] & there, S, 0)
+    start = jnp.where(there, value, 0), known, jnp.zeros((), dtype)
+    return jax.lax.fori_loop(0, len(value), one, start)[2], jnp.sum(there, dtype=dtype)

@@ -102,6 +102,8 @@ def test_a_pair_and_the_filters_innovation_are_alike_and_what_is_missing_counts_
     met = update(Belief(np.zeros(3), S), Reading(y, np.isfinite(y)), lambda x: x, R)[1]
     nll, rows = identify.surprise((y, S + np.diag(R)))
     assert np.isclose(nll, met.nll, rtol=1e-12) and rows == met.rows == 2
+    unknown = np.where(np.isfinite(y[:, None] + y), S + np.diag(R), np.nan)
+    assert identify.surprise((y, unknown))[0] == nll
     both = identify.surprise([(y, S + np.diag(R)), met])
     assert np.isclose(both[0], 2 * nll) and both[1] == 4
 
