@@ -45,16 +45,17 @@ SMALL = 0.1  # share of a direction's largest number below which a number is lef
 
 
 class Fit(NamedTuple):
-    """What flights tell of theta. With ``each=True`` every leaf leads with the flights."""
+    """What flights tell of p numbers, theta. With ``each=True`` every leaf has another axis in front, the flights.
 
-    theta: Any  # the most likely, a tree like the start
-    std: Any  # standard deviation of each number, likewise; NaN where the search did not end at a minimum
-    low: Any  # 95 % interval, likewise
+    theta, std, low, high and robust are trees of the shape of the start.
+    """
+
+    theta: Any  # the most likely
+    std: Any  # standard deviation of each number; NaN where the search did not end at a minimum
+    low: Any  # 95 % interval
     high: Any
     covariance: Any  # (p, p) of all numbers of theta in a row: inverse of the Hessian
-    robust: (
-        Any  # std by the sandwich, a tree like theta: holds where the innovations are white but not as the model says
-    )
+    robust: Any  # std by the sandwich: holds where the innovations are white, but not as the model says
     nll: Any  # [nats] negative log-likelihood of the innovations, prior left out
     gap: Any  # [nats] that a Newton step would still gain
     converged: Any  # bool, whether the Hessian is positive definite and the gap small
@@ -478,7 +479,7 @@ class Posterior(NamedTuple):
     """Draws of theta given the flights and the prior of the spread."""
 
     theta: Any  # (draws, ...) a tree like the start
-    divergent: Any  # share of draws whose trajectory diverged: above a percent, do not trust them
+    divergent: Any  # [1] share of draws whose trajectory diverged: above a percent, do not trust them
     effective: Any  # (p,) effective sample size of each number
 
 

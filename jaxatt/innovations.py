@@ -27,9 +27,7 @@ class Model(NamedTuple):
     """On-board code, and where it tells its innovations."""
 
     decide: Callable  # (params, now, computer, readings) -> computer, log, as in a closed loop
-    innovations: (
-        Callable  # of a log: an `Innovation`, a pair of value (k,) and covariance (k, k), NaN where missing, or a list
-    )
+    innovations: Callable  # of a log: an `Innovation`, a pair of value (k,) and covariance (k, k), or a list of these
     dt: float  # [s] between ticks
 
 
