@@ -15,7 +15,7 @@ wheels; `CONTROLLERS` holds the baselines, `CELLS` the faults.
     board = control([CONTROLLERS["pid"], CONTROLLERS["structured"], mine])
 
 Its modules may import: yardstick, check, fields, clock, contract, compiling, vec, attitude, faults, noise, engine,
-sweeping, scores, soft_scores, loss, detection, filters, batching.
+sweeping, scores, soft_scores, loss, detection, filters, batching, resuming.
 """
 
 from functools import cache

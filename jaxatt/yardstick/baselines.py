@@ -16,7 +16,7 @@ import numpy as np
 
 from jaxatt.attitude import mrp_from_quat, mrp_rate, mrp_rate_transposed
 from jaxatt.batching import in_lanes
-from jaxatt.detection import Cusum, cusum, window_sum
+from jaxatt.detection import Cusum, chi_square, cusum, smoothed, window_sum
 from jaxatt.vec import Quat, Vec3, cross, norm
 from jaxatt.yardstick import leo4
 from jaxatt.yardstick.leo4 import Telemetry
@@ -97,7 +97,7 @@ def summed(line, new):
 
 @cache
 def window_of(packets: int):
-    """The init of a window of so many packets."""
+    """The init of a window of so many packets, or of as many means."""
     return lambda params: jnp.zeros(packets)
 
 
@@ -201,6 +201,42 @@ def glr_step(params: GlrParams, z: GlrState, r, telemetry: Telemetry):
         best = jnp.maximum(best, jnp.abs(found))
     score = jnp.max(best)
     return GlrState(axes, parity), Verdict(score, jax.nn.softmax(0.5 * best * best))
+
+
+# the gyro tests of `gyro_ekf`
+
+
+class GyroParams(NamedTuple):
+    """The normalised innovations of the residuals, and the share of a new one in the mean."""
+
+    seen: Any  # (4, 7) of four gyros, or (1, 7) of their parity
+    memory: Any = 0.25  # that of the loop
+
+
+def gyro_rows(covariance) -> tuple[Detector, Detector]:
+    """The chi-squares of `jaxatt.loops.gyro_ekf`: of each gyro's innovation, and of the parity.
+
+    What a gyro reads beyond the rate that the model expects is the rate observer's innovation along its axis and its share
+    of the parity, y = G w + V p. covariance: (7, 7) of the residuals in healthy runs.
+    """
+    seen = np.zeros((5, 7))
+    seen[:4, 3], seen[:4, 4:] = leo4.PARITY, np.array(leo4.AXES).T / leo4.TICKS
+    seen[4, 3] = 1.0
+    seen = (seen / np.sqrt(np.diag(seen @ covariance @ seen.T))[:, None]).astype(np.float32)
+
+    def row(name: str, seen) -> Detector:
+        params = GyroParams(seen, np.float32(0.25))
+        return Detector(name, with_residuals(window_of(len(seen))), OnResiduals(gyro_step), params, 1)
+
+    return row("gyro_chi2", seen[:4]), row("gyro_parity", seen[4:])
+
+
+def gyro_step(params: GyroParams, mean, r, telemetry: Telemetry):
+    """The largest chi-square of the smoothed innovations; the gyro that has it is blamed, as `detection.worst_above` does."""
+    mean = smoothed(mean, product(params.seen, r), params.memory)
+    found = chi_square(mean, params.memory)
+    score = jnp.max(found)
+    return mean, Verdict(score, blame(gyro=jnp.where(found >= score, 1.0, 0.0).astype(score.dtype)))
 
 
 # ten packets' means, without dynamics
