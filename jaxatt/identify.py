@@ -532,16 +532,21 @@ def posterior(
             f.defvjp(lambda x: slopes(x, data), lambda slope, seed: (seed * slope,))
             return f
 
+        sampler: Any = blackjax.nuts
+
         def warmed(key, data):
-            adaptation = blackjax.window_adaptation(blackjax.nuts, density(data))
+            adaptation: Any = blackjax.window_adaptation(sampler, density(data))
             (state, numbers), _ = adaptation.run(key, jnp.zeros_like(at), warmup)
             return state, numbers
 
         def drawn(keys, state, numbers, data):
-            step = blackjax.nuts(density(data), **numbers).step
-            return jax.lax.scan(
-                lambda state, key: (lambda s, i: (s, (s.position, i.is_divergent)))(*step(key, state)), state, keys
-            )
+            step = sampler(density(data), **numbers).step
+
+            def one(state, key):
+                state, info = step(key, state)
+                return state, (state.position, info.is_divergent)
+
+            return jax.lax.scan(one, state, keys)
 
         first, *keys = jax.random.split(key, 1 + draws)
         state, numbers = jax.jit(warmed)(first, data)
