@@ -23,7 +23,7 @@ import numpy as np
 from jaxatt import check
 from jaxatt.clock import meant
 from jaxatt.compiling import compiled
-from jaxatt.stepping import on_board
+from jaxatt.stepping import on_board, timing_of
 
 
 def computer(
@@ -65,14 +65,13 @@ def computer(
         >>> sent = lambda computer, log: [(torque, payload(log.u))]
         >>> module = basilisk.computer(decide, params, start, dt=0.1, read=read, write=sent)
     """
-    for name, f in (("decide", decide), ("read", read), ("write", write), ("flow", flow)):
-        if f is not None or name in ("decide", "read"):
-            check.function(name, f)
-    check.positive("dt", dt := check.number("dt", dt))
+    dt, substeps = timing_of(decide, flow, dt, substeps)
+    check.function("read", read)
+    if write is not None:
+        check.function("write", write)
     nanos = meant(dt) * 10**9
     if nanos.denominator != 1:
         check.refuse("dt", "be a whole number of nanoseconds", f"{dt:.17g}")
-    substeps = check.whole("substeps", substeps)
     params, start = check.converted(params, check.numbers("start", start))
     return _module()(decide, flow, dt, int(nanos), substeps, params, start, read, write or (lambda computer, log: ()))
 

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxatt import check, fields, onboard
-from jaxatt.stepping import on_board
+from jaxatt.stepping import on_board, timing_of
 
 
 def write(
@@ -69,11 +69,7 @@ def write(
         >>> code = onboard.load("computer.zip")
         >>> computer, log = code.decide(0, code.params, code.computer, {"gyro.value.x": 0.1, ...})
     """
-    check.function("decide", decide)
-    if flow is not None:
-        check.function("flow", flow)
-    check.positive("dt", dt := check.number("dt", dt))
-    substeps = check.whole("substeps", substeps)
+    dt, substeps = timing_of(decide, flow, dt, substeps)
     if not isinstance(platforms, (tuple, list)) or not platforms or not set(platforms) <= set(PLATFORMS):
         check.refuse("platforms", f"be some of {', '.join(PLATFORMS)}", check.short(platforms))
     try:

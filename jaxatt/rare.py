@@ -94,7 +94,7 @@ def probability(
     kept = KEPT * repeats * event.size // event.chains
     size = f"`ticks` = {ticks} with `chains` = {chains}"
     check.fits_memory(size, event.bytes + kept, "use fewer chains, or runs of fewer ticks")
-    jobs = int(max(1, min(max(len(devices), programs_at_once()), (check.free_memory() - kept) // event.bytes)))
+    jobs = int(max(1, min(programs_at_once(), (check.free_memory() - kept) // event.bytes)))
     numbers = key, event.params, event.scenario, ticks, event.above, chains, moves
     mark = "" if path is None else mark_of(programs(event, key), numbers)
     pilot, done, looks = _resumed(path, mark, repeats)

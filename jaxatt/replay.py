@@ -29,7 +29,7 @@ from jaxatt.compiling import compiled
 from jaxatt.faults import Reading
 from jaxatt.loading import DIRECTIONS, Quaternion, Understood, agree, report_of, understood
 from jaxatt.logfiles import Layout
-from jaxatt.stepping import on_board
+from jaxatt.stepping import on_board, timing_of
 
 EXAMPLE = Path(__file__).parent / "data" / "telemetry.csv"  # made by notebooks/telemetry.py, with a hidden fault
 SPARSE = 1000  # ticks per sample beyond which the times are taken to be wrong
@@ -72,11 +72,7 @@ def replay(
     Example:
         >>> computers, logs = replay(loop.decide, loop.params, computer, readings, dt=loop.DT)
     """
-    check.function("decide", decide)
-    if flow is not None:
-        check.function("flow", flow)
-    check.positive("dt", check.number("dt", dt))
-    substeps = check.whole("substeps", substeps)
+    dt, substeps = timing_of(decide, flow, dt, substeps)
     ticks = _length("readings", readings)
     for name, tree in (("computer", computer), ("readings", readings), ("between", between)):
         check.numbers(name, tree)
@@ -86,7 +82,7 @@ def replay(
             name = f"between{jax.tree_util.keystr(path)}"
             check.refuse(name, f"have shape ({ticks}, {substeps}, 4, ...)", leaf.shape)
     operands = params, computer, readings, between
-    return compiled(_replay, 4, operands)(decide, flow, float(dt), substeps, *operands)
+    return compiled(_replay, 4, operands)(decide, flow, dt, substeps, *operands)
 
 
 def _length(name: str, tree) -> int:

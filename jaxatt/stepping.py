@@ -16,6 +16,16 @@ from jaxatt.contract import Now
 from jaxatt.engine import alone, match_state, rk4
 
 
+def timing_of(decide, flow, dt, substeps) -> tuple[float, int]:
+    """dt and substeps of on-board code, as of `on_board`; refuses what is no function, dt <= 0 and substeps < 1."""
+    check.function("decide", decide)
+    if flow is not None:
+        check.function("flow", flow)
+    dt = check.number("dt", dt)
+    check.positive("dt", dt)
+    return float(dt), check.whole("substeps", substeps)
+
+
 def on_board(
     decide: Callable, flow: Callable | None, dt: float, substeps: int, params, k, computer, readings, stages=None
 ):

@@ -122,7 +122,8 @@ def results(
 ) -> dict[str, np.ndarray]:
     """All that is stored of the scenarios start .. stop - 1, by name, each of shape (..., stop - start).
 
-    start: a multiple of 128. The scores are those of `sweep`, bit for bit. advance(n): n more are done; jobs: blocks at once, as of `sweeping.by_block`.
+    start: a multiple of 128. The scores are those of `sweep`, bit for bit. advance(n): n more are done; jobs:
+    blocks at once, as of `sweeping.by_block`.
     """
     scenarios, inputs = drawn(campaign, start, stop)
     params, scenarios = prepared(campaign.system, campaign.params, scenarios)
