@@ -30,6 +30,7 @@ from jaxatt.plot import COLOURS, GREY
 from jaxatt.sensors import Gyro, GyroState, StarTracker, gyro_read, star_axes, star_read
 from jaxatt.torque_matrix import times
 from jaxatt.vec import Mat3, Quat, Vec3, array, cross, diagonal, inverse, scaled_identity, skew, where, zeros
+from jaxatt.wheels import TorqueWheel, relative_speed, wheel_torque
 
 KEY = jax.random.key(2300)
 DEG = np.pi / 180
@@ -206,11 +207,15 @@ class Observer(NamedTuple):
     last: Telemetry
 
 
-def moved(params: Satellite, last: Telemetry, x):
-    """Rates of body rate and wheel momenta, `Vec3` and (4,), of the filter's state x (10,)."""
+def rubbing(coulomb, viscous) -> TorqueWheel:
+    """A wheel of microsat with this friction; at rest it is twice Coulomb's, as in the data sheet."""
+    friction = ms.WHEEL.friction._replace(coulomb=coulomb, viscous=viscous, stiction=2 * coulomb)
+    return ms.WHEEL._replace(friction=friction)
+
+
+def moved(params: Satellite, last: Telemetry, h_rate, x):
+    """Rates of body rate and wheel momenta, `Vec3` and (4,), of the filter's state x (10,); h_rate (4,) is held over the tick."""
     w, h = Vec3.of(x[RATE]), x[MOMENTUM]
-    speed = h / ms.WHEEL.J - ms.AXES @ w
-    h_rate = last.torque - jnp.sign(speed) * params.coulomb - params.viscous * speed
     magnetic = dipole_torque(last.moment + params.dipole, last.field)
     torque = magnetic - times(ms.AXES, h_rate) - cross(w, params.J @ w + times(ms.AXES, h))
     return inverse(params.J) @ torque, h_rate
@@ -219,7 +224,12 @@ def moved(params: Satellite, last: Telemetry, x):
 def decide_momentum(params: Satellite, now, computer: Observer, y: Telemetry):
     """Body rate, wheel momenta and gyro bias by gyro and tachometers; what they told."""
     elapsed = jnp.where(now.k > 0, now.dt, 0.0)
-    f = lambda x: moved(params, computer.last, x)
+    x = computer.belief.mean
+    wheel = rubbing(params.coulomb, params.viscous)
+    h_rate = wheel_torque(
+        wheel, computer.last.torque, relative_speed(wheel.J, x[MOMENTUM], ms.AXES, Vec3.of(x[RATE])), now.dt
+    )
+    f = lambda x: moved(params, computer.last, h_rate, x)
     belief = predict(computer.belief, f, jnp.zeros(3), NOISE, elapsed)
 
     def expected(x):
@@ -276,9 +286,8 @@ def satellites(ticks: int) -> Study:
         off = iter(draws)
         theta = jax.tree.map(lambda a, s: a + 0.3 * s * next(off), start, spread)
         told = satellite(theta)
-        rubs = ms.WHEEL.friction._replace(coulomb=told.coulomb, viscous=told.viscous, stiction=2 * told.coulomb)
         scenario = ms.scenario._replace(
-            J=told.J, wheels=ms.WHEEL._replace(friction=rubs), facets=still, act=0.0,
+            J=told.J, wheels=rubbing(told.coulomb, told.viscous), facets=still, act=0.0,
             turn=Vec3(*0.3 * draws[5:8]), bias=Vec3(*FIRST[-1] * draws[8:]),
         )  # fmt: skip
         y = simulate(system, params, scenario, second, ticks=ticks)
@@ -292,9 +301,23 @@ def satellites(ticks: int) -> Study:
 # the filter that closes gyro_ekf
 
 
+class Flown(NamedTuple):
+    """A tick of gyro_ekf's telemetry."""
+
+    readings: ekf.Readings
+    u: Any  # (4,) [in-lbf] commanded rates of wheel momentum, from now on
+
+
 def tick_ekf(params, scenario, now, x, z, noise):
-    """`gyro_ekf`, with its readings for a log."""
-    return (*ekf.tick(params, scenario, now, x, z, noise)[:2], ekf.sense(params, scenario, now, x, z, noise))
+    """`gyro_ekf`, with its telemetry for a log."""
+    x, z, _ = ekf.tick(params, scenario, now, x, z, noise)
+    return x, z, Flown(z.readings, z.computer.u)
+
+
+def decide_flown(params, now, computer, told: Flown):
+    """``decide`` of gyro_ekf on telemetry: the wheels had the command that flew, not that of other params."""
+    computer, log = ekf.decide(params, now, computer, told.readings)
+    return computer._replace(u=told.u), log
 
 
 SLEWING = ekf.consistent(ekf.params)._replace(
@@ -327,7 +350,7 @@ def geostationary(ticks: int) -> Study:
         y = simulate(system, SLEWING, scenario, second, ticks=ticks)
         return identify.Flights(ekf.computer_of(*ekf.init(SLEWING, scenario)), y), theta
 
-    model = identify.Model(ekf.decide, lambda log: log[0], ekf.DT)
+    model = identify.Model(decide_flown, lambda log: log[0], ekf.DT)
     return Study("gyro_ekf in a slew, its own filter", model, shipped, start, spread, jax.jit(jax.vmap(one)))
 
 

@@ -24,7 +24,11 @@ from jaxatt.engine import match_state
 
 
 class Model(NamedTuple):
-    """On-board code, and where it tells its innovations."""
+    """On-board code, and where it tells its innovations.
+
+    A filter that predicts with the command of its own ``decide`` must be given the command that flew, not that of other
+    params: record it and put it into the computer (docs/guides/identify.md).
+    """
 
     decide: Callable  # (params, now, computer, readings) -> computer, log, as in a closed loop
     innovations: Callable  # of a log: an `Innovation`, a pair of value (k,) and covariance (k, k), or a list of these
