@@ -45,6 +45,7 @@ class Study(NamedTuple):
     start: Any
     spread: Any
     fly: Callable  # keys (n,) -> flights, true theta (n, ...)
+    units: dict[str, str] = {}  # noqa: RUF012 - of parts of theta that have one
 
 
 # gyro and star tracker on a calibration manoeuvre
@@ -172,7 +173,7 @@ def calibrations(ticks: int) -> Study:
         return identify.Flights(mekf_start(LEVEL, zeros(), *BEGIN), y), theta
 
     model = identify.Model(decide_units, lambda log: log, STEP)
-    return Study("attitude filter, calibration manoeuvre", model, calibration, start, spread, fly)
+    return Study("attitude filter, calibration manoeuvre", model, calibration, start, spread, fly, {"turn": "rad"})
 
 
 # inertia and friction of microsat, by the momentum of its wheels
@@ -295,7 +296,8 @@ def satellites(ticks: int) -> Study:
         return identify.Flights(Observer(belief, jax.tree.map(lambda a: a[0], y)), y), theta
 
     model = identify.Model(decide_momentum, lambda log: log, ms.DT)
-    return Study("rate filter on microsat's telemetry", model, satellite, start, spread, jax.jit(jax.vmap(one)))
+    title, units = "rate filter on microsat's telemetry", {"J": "kg m^2"}
+    return Study(title, model, satellite, start, spread, jax.jit(jax.vmap(one)), units)
 
 
 # the filter that closes gyro_ekf
@@ -351,7 +353,8 @@ def geostationary(ticks: int) -> Study:
         return identify.Flights(ekf.computer_of(*ekf.init(SLEWING, scenario)), y), theta
 
     model = identify.Model(decide_flown, lambda log: log[0], ekf.DT)
-    return Study("gyro_ekf in a slew, its own filter", model, shipped, start, spread, jax.jit(jax.vmap(one)))
+    title, units = "gyro_ekf in a slew, its own filter", {"J": "in-lbf-s^2", "alpha": "rad"}
+    return Study(title, model, shipped, start, spread, jax.jit(jax.vmap(one)), units)
 
 
 # a walk that is measured: small enough for everything
@@ -499,12 +502,14 @@ def intervals(report, name: str, study: Study, found, truth) -> None:
             ends = error[pick] - below[pick], above[pick] - error[pick]
             ax.errorbar(np.flatnonzero(pick), error[pick], ends, fmt="o", ms=2, lw=0.8, color=colour, label=label)
         ax.axhline(0, color=GREY, lw=0.8)
-        ax.set(title=i, xticks=[])
+        unit = study.units.get(i.split(".")[0])
+        ax.set(title=f"{i} [{unit}]" if unit else i, xticks=[])
         ax.tick_params(labelsize=7)
     for ax in list(axes.flat)[len(true) :]:
         ax.set_visible(False)
     axes[0, 0].set_ylabel("estimate less truth")
     axes[0, 0].legend(fontsize=7, loc="lower right")
+    fig.supxlabel("flights, in the order of their errors")
     fig.suptitle(f"{study.title}: 95 % intervals of {len(by)} of {n} flights")
     report.figure(name, fig)
 
