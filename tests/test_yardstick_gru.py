@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from jaxatt.yardstick import bank, baselines, gru, learning, leo4, recording, rules, tune, worlds
-from jaxatt.yardstick.learning import Days, Plan, train
+from jaxatt.yardstick.learning import Days, Plan, Stretch, train
 from jaxatt.yardstick.telemetry import STD
 
-PLAN = Plan(rounds=3, days=16, passes=2, batch=8, rate=0.02)
+PLAN = Plan(rounds=3, days=16, passes=2, batch=18, rate=0.02)
 
 
 def plain_verdicts(p, r):
@@ -45,12 +45,19 @@ def test_the_shipped_unit_is_that_of_the_equations_alone_and_in_a_batch_and_as_i
         np.testing.assert_allclose(told.score[..., i], score, rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(told.blame[..., i], p[:, 1:], rtol=1e-9, atol=1e-12)
     assert told.score[-1, 1] > 3 > told.score[39].max() and told.blame[-1, :4, 1].sum() > 0.9
-    # the training's loss of these days, were channel 2 at fault in the second, is what these verdicts say
+    # the training's loss of these days, were channel 2 at fault in the second, is what these verdicts say, also in two parts
     truth = np.zeros((70, 12, 3), bool)
     truth[:, 0], truth[40:, 0, 1], truth[40:, 3, 1] = True, False, True
-    given = np.concatenate([1 - told.blame.sum(1, keepdims=True), told.blame], 1)[learning.UNJUDGED :]
-    wanted = -np.log(np.sum(given * truth[learning.UNJUDGED :], axis=1)).mean()
-    assert float(learning.loss(params, np.ones(32), r, truth)) == pytest.approx(wanted, rel=1e-5)
+    weight = np.random.default_rng(1).random((70, 3))
+    given = np.concatenate([1 - told.blame.sum(1, keepdims=True), told.blame], 1)
+    surprise = -weight * np.log(np.sum(given * truth, axis=1))
+    wanted = surprise[:30].mean(), surprise[30:].mean()
+    lost = lambda h, fresh, rows: learning.loss(
+        params, np.ones(32), h, Stretch(fresh, r[rows], truth[rows], weight[rows])
+    )
+    one, h = lost(np.ones((32, 3)), np.ones(3, bool), slice(0, 30))
+    two, h = lost(h, np.zeros(3, bool), slice(30, 70))
+    np.testing.assert_allclose([one, two], wanted, rtol=1e-5)
 
 
 def made_up(key, n):
@@ -61,20 +68,49 @@ def made_up(key, n):
     return Days(r, onset, np.tile(np.arange(11) == 1, (n, 1)))
 
 
-def test_windows_hold_the_onset_and_the_truth():
+def test_stretches_are_days_from_first_to_last_packet():
+    plan = Plan(days=50, passes=2, batch=18)
     days = made_up(jax.random.key(0), 50)
     days.r[..., 0] = np.arange(worlds.PACKETS)  # the packet's number
     days.r[..., 1] = np.arange(50)[:, None]
-    at = np.random.default_rng(1).permutation(50)[:40]
-    r, truth = learning.windows(days, at, np.random.default_rng(2))
-    assert r.shape == (200, 7, 80) and truth.shape == (200, 12, 80)
-    packet, day = r[:, 0], r[0, 1].astype(int)
-    np.testing.assert_array_equal(day, np.tile(at, 2))
-    assert (np.diff(packet, axis=0) == 1).all() and (packet >= learning.UNJUDGED).all()
-    on = packet >= days.onset[day]
-    np.testing.assert_array_equal(truth[:, 0], ~on)
-    np.testing.assert_array_equal(truth[:, 1:], (np.arange(11) == 1)[:, None] & on[:, None])
-    assert not on[:, 40:].any() and not on[: learning.LEAST, :40].any() and on[-1, :40].all()
+    days.onset[:10] = learning.NEVER
+    told = list(learning.stretches(days, plan, np.random.default_rng(2)))
+    assert len(told) == plan.steps == 50
+    fresh, r, truth, weight = (np.stack(a) for a in zip(*told))  # (steps, packets, ..., lanes)
+    assert r.shape == (50, 200, 7, 18) and truth.shape == (50, 200, 12, 18)
+    seen = []
+    for lane in range(18):
+        starts = np.flatnonzero(fresh[:, lane])
+        assert not weight[: starts[0], :, lane].any() and starts[0] < 9 and (np.diff(starts) == 9).all()
+        for k in starts[starts + 9 <= 50]:
+            packet, day = (np.concatenate(r[k : k + 9, :, i, lane]) for i in (0, 1))
+            (which,) = set(day.astype(int))
+            assert 0 <= packet[0] <= 600
+            np.testing.assert_array_equal(packet, np.minimum(packet[0] + np.arange(1800), 1799))
+            on, over = packet >= days.onset[which], packet[0] + np.arange(1800) > 1799
+            here, w = np.concatenate(truth[k : k + 9, ..., lane]), np.concatenate(weight[k : k + 9, :, lane])
+            np.testing.assert_array_equal(here[:, 0], ~on)
+            np.testing.assert_array_equal(here[:, 1:], (np.arange(11) == 1) & on[:, None])
+            late = packet >= days.onset[which] + 120
+            assert not w[late | over].any() and w[~on & ~over].all() and w[on & ~late & ~over].all()
+            seen.append(which)
+    assert len(seen) >= 72 and set(np.bincount(seen)) <= {1, 2}  # days come in turn
+
+
+def test_a_packet_of_any_number_is_as_likely_faulty_as_healthy():
+    rng = np.random.default_rng(3)
+    onset, first = (
+        np.where(rng.random(4000) < 0.2, learning.NEVER, rng.integers(720, 1680, 4000)),
+        rng.integers(0, 601, 4000),
+    )
+    calm, faulty = learning.weights(onset, first)
+    k = np.arange(1800)[:, None] + first
+    on, judged = k >= onset, k < np.minimum(onset + 120, 1800)
+    sums = calm * np.sum(~on & (k < 1800), 1), faulty * np.sum(on & judged, 1)
+    likely = slice(300, 1500)  # where a day may be either
+    np.testing.assert_allclose(sums[0][likely], sums[1][likely], rtol=1e-9)
+    np.testing.assert_allclose(sums[0][likely], sums[0][300], rtol=1e-9)
+    assert max(calm.max(), faulty.max()) == learning.HEAVIEST
 
 
 @pytest.mark.short
@@ -82,8 +118,10 @@ def test_a_drawn_day_is_one_of_the_public_catalogue_with_its_onset_and_channel(m
     monkeypatch.setattr(recording, "residuals_of", lambda days, key: days)
     found = learning.drawn(jax.random.key(4), 256)
     days = found.r
-    np.testing.assert_allclose(found.onset, np.floor((worlds.onset_of(days) + 300) / 0.5), atol=0)
-    assert set(found.channels.sum(1)) == {1, 3}
+    onset = np.floor((worlds.onset_of(days) + 300) / 0.5)
+    assert 0.1 < np.mean(np.isinf(onset)) < 0.3
+    np.testing.assert_array_equal(found.onset, np.where(np.isinf(onset), learning.NEVER, onset))
+    assert set(found.channels[np.isfinite(worlds.onset_of(days))].sum(1)) == {1, 3}
     bias = np.abs(days.gyro.bias[np.isfinite(days.gyro.onset)]) / leo4.SECOND
     sizes = np.unique(bias[bias > 0])
     assert len(sizes) > 5 and all(np.isclose(s, worlds.SIZED["gyro_bias"], rtol=1e-4).any() for s in sizes)
@@ -114,8 +152,8 @@ def test_a_training_learns_and_a_killed_one_goes_on_with_the_same_numbers(monkey
     for other, plan in ((key, PLAN._replace(rate=0.01)), (jax.random.key(6), PLAN)):
         with pytest.raises(ValueError, match="`save` must hold a training of the same key, plan, program and JAX"):
             train(other, plan, save=file)
-    with pytest.raises(ValueError, match=r"`plan.days` must be a multiple of plan.batch, 8, but it is 20"):
-        train(key, PLAN._replace(days=20))
+    with pytest.raises(ValueError, match=r"`plan.batch` must be at most 288, or no step is made, but it is 289"):
+        train(key, PLAN._replace(batch=289))
 
 
 def test_gyro_tests_read_what_a_gyro_reads_too_much():

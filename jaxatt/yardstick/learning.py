@@ -1,10 +1,12 @@
 """Train the learned row by gradient: days of leo4 with faults of the public catalogue, key and sizes public, no test day.
 
-Each round simulates days afresh, each with a fault of a kind and a public size drawn evenly, and cuts windows of a
-hundred seconds from them, half of them before the onset. The loss is the mean of -ln of the probability given to what is true at
-each packet: no fault, or one of the faulty channels.
+Each round simulates days afresh: a fifth without a fault, each of the others with one of a kind and a public size drawn evenly. A
+step of the descent reads the next hundred seconds of many days, each at another hour, and the state goes on from step to step:
+a unit that learns from short windows alone drifts over a long day. The loss is the mean of -ln of the probability given to
+what is true at each packet, no fault or one of the faulty channels. A day is read from a packet drawn evenly from the warm-up, and
+at every packet from there on healthy and faulty days weigh alike: a unit that counts packets gains nothing.
 
-May import: gru, recording, worlds, leo4, check, compiling, noise, resuming, sweeping.
+May import: gru, recording, worlds, leo4, metrics, check, compiling, noise, resuming, sweeping.
 """
 
 from __future__ import annotations
@@ -26,26 +28,31 @@ from jaxatt.sweeping import progress_bar
 from jaxatt.yardstick import gru, recording, worlds
 from jaxatt.yardstick.gru import CLASSES, HIDDEN, UNITS, Gru
 from jaxatt.yardstick.leo4 import PACKET
+from jaxatt.yardstick.metrics import HORIZON
 from jaxatt.yardstick.worlds import SIZED
 
-LENGTH, UNJUDGED = 200, 40  # [packets] of a window, and of its start, in which the state still fills
-LEAST, MOST = 80, 140  # [packets] from the start of a faulty window to the onset
+LENGTH = 200  # [packets] of a day in one step
+PARTS = worlds.PACKETS // LENGTH  # steps of a day
+JUDGED = round(HORIZON / PACKET)  # [packets] from the onset
+SKIPPED = round(worlds.WARMUP / PACKET)  # [packets] at most, before the first that is read
+HEAVIEST = 20.0  # weight of a packet over the mean, at most
+NEVER = 10 * worlds.PACKETS  # onset of a day without a fault
 QUICKEST, SLOWEST = 2.0, 80.0  # [packets] memories of the units at the start of the training
 
 
 class Plan(NamedTuple):
-    """How much is trained: ``rounds`` of so many days, each met ``passes`` times, ``batch`` days a step."""
+    """How much is trained: ``rounds`` of so many days, each met ``passes`` times, ``batch`` days side by side."""
 
-    rounds: int = 5
+    rounds: int = 6
     days: int = 4096
-    passes: int = 8
-    batch: int = 128
+    passes: int = 4
+    batch: int = 252
     rate: float = 4e-3  # of Adam, after a rise over 100 steps, or a quarter of all; falls to 0 by a cosine
 
     @property
     def steps(self) -> int:
-        """Of a round."""
-        return self.passes * (self.days // self.batch)
+        """Of a round; days still under way at its end are left."""
+        return PARTS * self.passes * self.days // self.batch
 
 
 SHIPPED = Plan()  # of the numbers in the package
@@ -62,30 +69,69 @@ class Days(NamedTuple):
     """Days to learn from."""
 
     r: Any  # (n, 1800, 7) residuals
-    onset: Any  # (n,) number of the first packet that the fault has touched
+    onset: Any  # (n,) number of the first packet that the fault has touched; NEVER without a fault
     channels: Any  # (n, 11) bool
 
 
 def drawn(key, n: int) -> Days:
-    """n days with a fault: kinds evenly, and the public sizes of each."""
+    """n days, a fifth of them without a fault; of the others the kinds evenly, and the public sizes of each."""
     cells = [(kind, size) for kind, sizes in SIZED.items() for size in sizes]
+    cells += [None] * (len(cells) // 4)
     table = jax.tree.map(lambda *a: np.array(a, np.float32), *(worlds.effects(cell) for cell in cells))
     at = np.asarray(jax.random.randint(jax.random.fold_in(key, 1), (n,), 0, len(cells), jnp.int32))
     days = worlds.days(worlds.WORLDS["leo4"], key, np.arange(n), jax.tree.map(lambda a: a[at], table))
-    onset = np.floor((worlds.onset_of(days) + worlds.WARMUP) / PACKET).astype(int)
+    onset = np.floor((worlds.onset_of(days) + worlds.WARMUP) / PACKET)
+    onset = np.where(np.isfinite(onset), onset, NEVER).astype(int)
     return Days(recording.residuals_of(days, key), onset, worlds.true_channels(days))
 
 
-def windows(days: Days, at, rng) -> tuple[np.ndarray, np.ndarray]:
-    """A faulty window of each of the days ``at``, and one before the onset: residuals (200, 7, 2 n), truth (200, 12, 2 n)."""
-    onset, n = days.onset[at], len(at)
-    faulty = np.minimum(onset - rng.integers(LEAST, MOST, n), worlds.PACKETS - LENGTH)
-    calm = UNJUDGED + np.floor(rng.random(n) * (onset - LENGTH - UNJUDGED)).astype(int)
-    rows = np.concatenate([faulty, calm]) + np.arange(LENGTH)[:, None]
-    which = np.concatenate([at, at])
-    on = (rows >= np.concatenate([onset, onset]))[:, None]
-    truth = np.concatenate([~on, on & days.channels[which].T], axis=1)
-    return np.ascontiguousarray(np.moveaxis(days.r[which, rows], -1, 1)), truth
+class Stretch(NamedTuple):
+    """What a step reads: a hundred seconds of n days."""
+
+    fresh: Any  # (n,) bool, days that begin: their state does
+    r: Any  # (200, 7, n) residuals
+    truth: Any  # (200, 12, n) bool: no fault, and the channels
+    weight: Any  # (200, n) of a packet; mean 1, but for the rarest
+
+
+def weights(onset, first) -> tuple[np.ndarray, np.ndarray]:
+    """Weights (1800,) of a healthy and of a faulty packet by its number in the reading: the days of a number weigh alike in sum.
+
+    onset, first: (n,) packets of the onset and of the start of the reading.
+    """
+    k = np.arange(worlds.PACKETS)[:, None]
+    there, on = k + first < worlds.PACKETS, k >= onset - first
+    counts = np.sum(there & ~on, 1), np.sum(there & on & (k < onset - first + JUDGED), 1)
+    scale = 0.5 * np.sum(np.add(*counts)) / worlds.PACKETS
+    return tuple(np.minimum(scale / np.maximum(count, 1), HEAVIEST) for count in counts)
+
+
+def stretches(days: Days, plan: Plan, rng):
+    """The stretches of a round. The lanes are at different hours; one that has ended its day begins another.
+
+    At the start of a round a lane waits, without weight, until its hour is the first. What lies behind a day's end, of one
+    that is not read from its first packet, is its last packet without weight.
+    """
+    n = len(days.onset)
+    order = np.concatenate([rng.permutation(n) for _ in range(plan.passes + 1)])
+    first = rng.integers(0, SKIPPED + 1, n)
+    calm, faulty = weights(days.onset, first)
+    lanes, at = np.arange(plan.batch), np.zeros(plan.batch, int)
+    taken, begun = 0, np.zeros(plan.batch, bool)
+    for k in range(plan.steps):
+        part = (k + lanes) % PARTS
+        fresh = part == 0
+        at[fresh] = order[taken : taken + fresh.sum()]
+        taken, begun = taken + fresh.sum(), begun | fresh
+        number = LENGTH * part + np.arange(LENGTH)[:, None]
+        packet, onset = first[at] + number, days.onset[at]
+        on = packet >= onset
+        truth = np.concatenate([~on[:, None], on[:, None] & days.channels[at].T], axis=1)
+        weight = (
+            begun * (packet < worlds.PACKETS) * np.where(on, faulty[number] * (packet < onset + JUDGED), calm[number])
+        )
+        r = np.ascontiguousarray(np.moveaxis(days.r[at, np.minimum(packet, worlds.PACKETS - 1)], -1, 1))
+        yield Stretch(fresh, r, truth, weight.astype(np.float32))
 
 
 def start(key, whiten) -> tuple[Gru, np.ndarray]:
@@ -106,10 +152,10 @@ def start(key, whiten) -> tuple[Gru, np.ndarray]:
     return Gru(*(np.asarray(a, np.float32) for a in made)), scale.astype(np.float32)
 
 
-def loss(params: Gru, scale, r, truth):
-    """Mean of -ln p(truth) over the judged packets of windows: r (200, 7, n), truth (200, 12, n) bool.
+def loss(params: Gru, scale, h, told: Stretch):
+    """-ln p(truth) by the weights of the packets, their mean, and the state (32, n) at the end.
 
-    The windows come last, so that a product is one for all of them; a packet is one step of the scan from residuals to loss,
+    The days come last, so that a product is one for all of them; a packet is one step of the scan from residuals to loss,
     for a CPU then leaves nothing between them in memory.
     """
 
@@ -120,14 +166,13 @@ def loss(params: Gru, scale, r, truth):
 
     def packet(state, told):
         h, total = state
-        r, truth, judged = told
+        r, truth, weight = told
         h, lost = jax.vmap(one, in_axes=-1, out_axes=-1)(h, r, truth)
-        return (h, total + judged * jnp.mean(lost)), None
+        return (h, total + jnp.mean(weight * lost)), None
 
-    kind = jnp.result_type(r)
-    judged = np.where(np.arange(len(r)) < UNJUDGED, 0, 1 / (len(r) - UNJUDGED)).astype(kind)
-    nothing = jnp.zeros((UNITS, r.shape[-1]), kind), jnp.zeros((), kind)
-    return jax.lax.scan(packet, nothing, (r, truth, judged))[0][1]
+    h = jnp.where(told.fresh, 0, h)
+    (h, total), _ = jax.lax.scan(packet, (h, jnp.zeros((), h.dtype)), told[1:])
+    return total / len(told.r), h
 
 
 def _surprise(found, truth):
@@ -136,12 +181,12 @@ def _surprise(found, truth):
     return jnp.log(jnp.sum(weights)) - jnp.log(jnp.sum(jnp.where(truth, weights, 0)) + 1e-30)
 
 
-def _step(plan: Plan, trained, scale, r, truth):
-    """A step of Adam: numbers and the optimiser's state, and the loss before it."""
+def _step(plan: Plan, trained, scale, h, told: Stretch):
+    """A step of Adam: numbers and the optimiser's state, the states of the days, and the loss before it."""
     params, state = trained
-    value, slope = jax.value_and_grad(loss)(params, scale, r, truth)
+    (value, h), slope = jax.value_and_grad(loss, has_aux=True)(params, scale, h, told)
     updates, state = _optimizer(plan).update(slope._replace(whiten=0 * slope.whiten), state)
-    return (optax.apply_updates(params, updates), state), value
+    return (optax.apply_updates(params, updates), state), h, value
 
 
 def _optimizer(plan: Plan) -> optax.GradientTransformation:
@@ -164,36 +209,35 @@ def train(key, plan: Plan = SHIPPED, *, save: str | Path | None = None, progress
         `Trained`; the same bits on the same machine and JAX.
 
     Raises:
-        ValueError: a plan of less than a round, a day or a pass, or whose batch does not divide its days; a file of
-            another training.
+        ValueError: a plan of less than a round, a day, a pass or a step; a file of another training.
 
     Example:
         >>> found = train(jax.random.key(0), Plan(rounds=2, days=256), save="gru_training.npz")
     """
     for name in ("rounds", "days", "passes", "batch"):
         check.whole(f"plan.{name}", getattr(plan, name))
-    if plan.days % plan.batch:
-        check.refuse("plan.days", f"be a multiple of plan.batch, {plan.batch}", plan.days)
+    if not plan.steps:
+        check.refuse("plan.batch", f"be at most {PARTS * plan.passes * plan.days}, or no step is made", plan.batch)
     data = one_key(key)
     key = jax.random.wrap_key_data(jnp.asarray(data))
     params, scale = start(key, recording.whitening(recording.public()))
     at, history = (params, _optimizer(plan).init(params)), []
     step = jitted(partial(_step, plan))
-    shapes = [jax.ShapeDtypeStruct((LENGTH, n, 2 * plan.batch), kind) for n, kind in ((7, np.float32), (12, bool))]
+    none = np.zeros((UNITS, plan.batch), np.float32)
+    sizes = (((), bool), ((LENGTH, 7), np.float32), ((LENGTH, CLASSES), bool), ((LENGTH,), np.float32))
+    shapes = Stretch(*(jax.ShapeDtypeStruct((*size, plan.batch), kind) for size, kind in sizes))
     path = None if save is None else check.place("save", save)
     if path is not None:
-        mark = mark_of([step.lower(at, scale, *shapes)], (data, at, scale, tuple(plan)))
+        mark = mark_of([step.lower(at, scale, none, shapes)], (data, at, scale, tuple(plan)))
         at, history = _resumed(path, mark, at)
     total = plan.rounds * plan.steps
     with progress_bar(progress, total, " steps", plan.steps * len(history)) as bar:
         for k in range(len(history), plan.rounds):
-            days, losses = drawn(jax.random.fold_in(key, k), plan.days), []
-            rng = np.random.default_rng([*map(int, data), k])
-            for _ in range(plan.passes):
-                for batch in rng.permutation(plan.days).reshape(-1, plan.batch):
-                    at, value = step(at, scale, *windows(days, batch, rng))
-                    losses.append(value)
-                    bar.update()
+            days, h, losses = drawn(jax.random.fold_in(key, k), plan.days), none, []
+            for told in stretches(days, plan, np.random.default_rng([*map(int, data), k])):
+                at, h, value = step(at, scale, h, told)
+                losses.append(value)
+                bar.update()
             history.append(np.mean(jax.device_get(losses)))
             bar.set_postfix(loss=f"{history[-1]:.4f}", refresh=False)
             if path is not None:
