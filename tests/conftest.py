@@ -28,8 +28,8 @@ gc.set_threshold(50_000, 20, 50)  # programs and traces are many objects that st
 # keeps programs of another matmul precision apart, which means nothing on a CPU, but not those of other optimisations.
 SHORT = {
     "test_attitude", "test_bodies", "test_controllers", "test_detection", "test_engine", "test_environment", "test_filters",
-    "test_flags", "test_guidance", "test_linear", "test_mekf", "test_replay", "test_soft_scores",
-    "test_torque_matrix", "test_tuning_star_isolation", "test_usque", "test_wheels",
+    "test_flags", "test_guidance", "test_gyro_ekf", "test_linear", "test_mekf", "test_replay", "test_soft_scores",
+    "test_star_isolation", "test_torque_matrix", "test_tuning_star_isolation", "test_usque", "test_wheels",
 }  # fmt: skip
 
 

@@ -429,7 +429,6 @@ def test_what_is_missing_feeds_no_window_and_brings_no_verdict():
     assert verdict.latched_cause == 1 and verdict.angle_alarm == (verdict.angle > p.angle_threshold)
 
 
-@pytest.mark.short
 def test_gradients_pass_what_is_missing():
     _, z = star.init(star_filters.LMMSE, 1, params, healthy)
 
