@@ -28,11 +28,11 @@ def rows(quick: bool) -> list[dict]:
             run(world, members, key, days)
             if turn:  # the first compiles
                 spent[label].append(time.process_time() - started)
-    ticks = DAYS * worlds.PACKETS * leo4.TICKS
+    ticks = DAYS * world.packets * leo4.TICKS
     cost = {label: 1e9 * float(np.median(times)) / ticks for label, times in spent.items()}
     alone = cost["loop without rows"]
     whole = [{"name": label, "value": cost[label], "unit": "core-ns"} for label in ("loop without rows", f"all {len(names)} rows")]  # fmt: skip
     each = [{"name": f"{name} in the loop, more", "value": cost[name] - alone, "unit": "core-ns"} for name in sets if name in names]  # fmt: skip
     ratio = {"name": "all rows over the loop", "value": cost[f"all {len(names)} rows"] / alone, "unit": "x"}
-    packet = {"name": "glr alone, a packet of one day", "value": rules.checked(tune("glr")).nanoseconds, "unit": "core-ns"}  # fmt: skip
+    packet = {"name": "glr alone, a packet of one day", "value": rules.checked(tune("glr"), world, rules.records(world)).nanoseconds, "unit": "core-ns"}  # fmt: skip
     return [*whole, ratio, *each, packet]

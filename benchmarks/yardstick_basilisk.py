@@ -20,6 +20,7 @@ import numpy as np
 from jaxatt import simulate
 from jaxatt.noise import noise_of
 from jaxatt.yardstick import leo4, tune, worlds
+from jaxatt.yardstick.kinds import effects
 
 KEY = 20
 CELLS = (("gyro_bias", 9.35), ("star_bias", 42.5), ("wheel_offset", 0.36), ("wheel_loss", 1.0))
@@ -215,11 +216,11 @@ def main() -> None:
     packets, n, key = round(args.seconds / leo4.PACKET), max(1, args.days // len(CELLS)), jax.random.key(KEY)
     world, numbers = worlds.WORLDS["leo4"], np.arange(2 * n * len(CELLS))
     cells = [None] * (n * len(CELLS)) + [cell for cell in CELLS for _ in range(n)]
-    both = jax.tree.map(lambda *a: np.array(a, np.float32), *(worlds.effects(cell) for cell in cells))
+    both = jax.tree.map(lambda *a: np.array(a, np.float32), *(effects(cell) for cell in cells))
     day = jax.tree.map(lambda a: np.asarray(a, float), worlds.days(world, key, numbers, both))
-    share = args.seconds / (worlds.WARMUP + worlds.WINDOW)
+    share = args.seconds / (world.warmup + world.window)
     shifted = lambda fault: fault._replace(onset=share * fault.onset)
-    day = day._replace(**{unit: shifted(getattr(day, unit)) for unit in worlds.UNITS})
+    day = day._replace(**{unit: shifted(getattr(day, unit)) for unit in world.units})
     noise = np.stack([np.asarray(noise_of(leo4.system, key, int(i), packets), float) for i in numbers])
     begun = time.process_time()
     theirs = basilisk(day, noise, packets * leo4.TICKS)

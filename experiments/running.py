@@ -38,7 +38,7 @@ EXPERIMENTS = {
     "wheel_mrac": Experiment(30, 77, "loss_of_effectiveness"),
     "microsat": Experiment(90, 61, "reconfiguration"),
     "rare_events": Experiment(45, 16, "curves"),
-    "yardstick": Experiment(140, 46, "board"),
+    "yardstick": Experiment(230, 57, "board"),
     "identify": Experiment(30, 6, "walk"),
 }
 NAMES = tuple(EXPERIMENTS)

@@ -2,7 +2,7 @@
 
 Tolerances are three standard errors of both sides: the reference took 24 000 windows to calibrate, 16 384 to validate and 320
 days a cell. Quick: a thousand windows, four rows and twelve cells; the same checks where they can be made. Controllers:
-`yardstick_control`.
+`yardstick_control`; the second world: `yardstick_microsat`.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from experiments import yardstick_control
+from experiments import yardstick_control, yardstick_microsat
 from jaxatt import simulate, soft_scores
-from jaxatt.yardstick import NAMES, bank, baselines, leo4, metrics, oracle, rank, telemetry, tune, worlds
+from jaxatt.yardstick import NAMES, bank, baselines, leo4, leo4_days, metrics, oracle, rank, telemetry, tune, worlds
 from jaxatt.yardstick.board import differences
 from jaxatt.yardstick.calibration import rate_of, threshold_of, threshold_slope
 from jaxatt.yardstick.descent import at_fixed_rate
@@ -86,6 +86,7 @@ def run(report) -> None:
     white_noise(report)
     board(report)
     yardstick_control.run(report)
+    yardstick_microsat.run(report)
     if not report.quick:
         learned(report)
         tuned_cusum(report)
@@ -118,15 +119,17 @@ def model(report) -> None:
     """The linear packet model against the loop, and the oracle of it against its closed form."""
     wanted = bank.signatures()
     quiet = jax.tree.map(lambda a: np.asarray(a, float), leo4.scenario)
-    start, packets = round(worlds.WARMUP / leo4.PACKET), round(worlds.WARMUP / leo4.PACKET) + bank.LENGTH
+    start, packets = round(leo4_days.WARMUP / leo4.PACKET), round(leo4_days.WARMUP / leo4.PACKET) + bank.LENGTH
     none = np.zeros((packets, leo4.system.normals))
     step = jax.jit(telemetry.residuals_step)
     worst = []
     for unit, h, size in (("gyro", 1, leo4.SECOND), ("star", 4, leo4.SECOND), ("wheel", 8, 1e-5)):
-        n, first = worlds.UNITS[unit], {"gyro": 0, "star": 4, "wheel": 7}[unit]
+        n, first = leo4_days.UNITS[unit], {"gyro": 0, "star": 4, "wheel": 7}[unit]
         here = np.arange(n) == h - first
         sign = -1.0 if unit == "wheel" else 1.0  # a friction is taken off
-        fault = getattr(quiet, unit)._replace(onset=np.where(here, worlds.WARMUP, np.inf), bias=np.full(n, sign * size))
+        fault = getattr(quiet, unit)._replace(
+            onset=np.where(here, leo4_days.WARMUP, np.inf), bias=np.full(n, sign * size)
+        )
         told = simulate(leo4.system, leo4.params, quiet._replace(**{unit: fault}), none, ticks=packets).telemetry
         state, seen = jax.tree.map(lambda a: a.astype(float), telemetry.residuals_init()), []
         for k in range(packets):
@@ -188,8 +191,7 @@ def ewma_at_rate(memory: float, key, n: int, packets: int, rate: float = 0.1) ->
     """Delay at a fixed rate of false alarms and its slope: D_x + D_h dh/dx; windows and runs by the key."""
     calm, faulty = jax.random.split(key)
     maxima, moved = (np.asarray(a) for a in ewma_peaks(memory, calm, n, packets))
-    # a level of windows of 600 s for those of another length
-    threshold = threshold_of(maxima, rate * packets * leo4.PACKET / worlds.WINDOW)[0]
+    threshold = threshold_of(maxima, rate, packets * leo4.PACKET)[0]
     (slope,), (error,) = threshold_slope(maxima, moved[:, None], threshold)
     (delay, sharp), (part, by_threshold) = jax.tree.map(float, ewma_delay(memory, threshold, faulty))
     found = {"delay": delay, "rmd": sharp, "partial": part, "slope": slope, "error": error, "threshold": threshold}
@@ -261,7 +263,7 @@ def tuned_cusum(report) -> None:
     report.note(f"the best is {np.round(best[1], 3)}")
     params = jax.tree.map(lambda a: np.asarray(a, np.float32), cusum_of(best[1])[0])
     tuned = tune("cusum")._replace(name="cusum, tuned", params=params, tuned=4)
-    cells = [(kind, size) for kind, sizes in worlds.SIZED.items() for size in sizes]
+    cells = [(kind, size) for kind, sizes in leo4_days.SIZED.items() for size in sizes]
     found = rank([tuned, tune("cusum")], ruleset="open", days=128, hours=2000, cells=cells)
     gap, error = found.pairs.difference[0, 1], found.pairs.error[0, 1]
     report.note(f"macro of cusum, tuned less shipped, on fresh days: {gap:.2f} +- {error:.2f} s")
@@ -277,7 +279,7 @@ def bounds(report) -> None:
     for kind, delays in {
         "gyro_bias": (24.1, 10.9, 4.46, 1.23), "star_bias": (58.0, 53.4, 36.0, 8.15), "wheel_offset": (54.1, 24.1, 3.48, 1.93)
     }.items():  # fmt: skip
-        found = [oracle.delay(kind, size, covariance=covariance) for size in worlds.SIZED[kind][:4]]
+        found = [oracle.delay(kind, size, covariance=covariance) for size in leo4_days.SIZED[kind][:4]]
         report.relative(f"oracle's RMD60, {kind} [s]", list(delays), found, 0.02, "closed form")
 
 
@@ -313,7 +315,7 @@ def board(report) -> None:
 
     shift = by_threshold(found, names, [*CELLS, *([] if report.quick else MMAE)], days)
     for cell, delays in CELLS.items():
-        table = found.cells[" ".join([cell[0], f"{cell[1]:g}"]) if cell[0] not in worlds.PLAIN else cell[0]]
+        table = found.cells[" ".join([cell[0], f"{cell[1]:g}"]) if cell[0] not in leo4_days.PLAIN else cell[0]]
         here = [(name, d) for name, d in zip(ROWS, delays) if name in classical]
         # .05 is the rounding of the printed numbers
         errors = [error_of(table[name], d, days) * np.sqrt(1 + days / DAYS) for name, d in here]
@@ -367,7 +369,7 @@ def whole(report, found, classical, shift) -> None:
     for name in classical:
         row = found.row(name)
         *units, macro = DELAYS[name]
-        report.check(f"RMD60 of gyro, star, wheel, {name} [s]", units, [row["units"][u] for u in worlds.UNITS], 2.0, REFERENCE)  # fmt: skip
+        report.check(f"RMD60 of gyro, star, wheel, {name} [s]", units, [row["units"][u] for u in leo4_days.UNITS], 2.0, REFERENCE)  # fmt: skip
         report.check(f"macro, {name} [s]", macro, row["macro"], 1.1, REFERENCE)
     place = found.matrix["names"].index
     for (a, b), wanted in PAIRED.items():
@@ -382,13 +384,13 @@ def whole(report, found, classical, shift) -> None:
         got = [row["detectable"].get(kind, [None])[0] or np.inf for row in found.rows if row["rank"]]
         report.within(f"no row below the bound, {kind}", 0.95 * oracle.bound(kind), None, got, "closed form")
     rising = []
-    for kind, sizes in worlds.SIZED.items():
+    for kind, sizes in leo4_days.SIZED.items():
         for name in found.matrix["names"]:
             v, se = np.array([found.cells[f"{kind} {size:g}"][name][:2] for size in sizes]).T
             rising.append(np.max(np.diff(v) - 3 * np.hypot(se[1:], se[:-1])))
     report.within("RMD60 falls with size, within 3 standard errors [s]", None, 0.0, max(rising), REFERENCE)
     right = found.row("glr")["isolation"]["right"]
-    seen = [sum(found.cells[f"{kind} {size:g}"]["glr"][3] for size in worlds.SIZED[kind]) * 256 for kind in RIGHT]
+    seen = [sum(found.cells[f"{kind} {size:g}"]["glr"][3] for size in leo4_days.SIZED[kind]) * 256 for kind in RIGHT]
     wide = [max(0.01, 3 * np.sqrt(p * (1 - p) / n * (1 + 256 / DAYS))) for p, n in zip(RIGHT.values(), seen)]
     report.check("channel right, glr", list(RIGHT.values()), [right[k] for k in RIGHT], wide, REFERENCE)
     report.check("random: P60 [%]", 0.17, found.row("random")["p60"], 0.1, "closed form")
@@ -431,7 +433,7 @@ def cross_check(report, n: int = 24_000, days: int = 256) -> None:
     """One threshold for both modes, and the plain mean of RMD60 over 29 cells of an earlier board."""
     detectors = [tune(name) for name in COMMON]
     peaks = largest(detectors, jax.random.key(31), n)
-    pooled = [threshold_of(peaks[:, d], 0.1)[0] for d in range(len(detectors))]
+    pooled = [threshold_of(peaks[:, d], 0.1, WORLD.window)[0] for d in range(len(detectors))]
     wide = [0.03 if name == "cusum" else 0.01 for name in COMMON]
     report.check("common thresholds", list(COMMON.values()), pooled, (np.array(wide) * list(COMMON.values())).tolist(), REFERENCE)  # fmt: skip
     found, key = [], jax.random.key(32)
@@ -450,10 +452,10 @@ def coverage(report, keys: int = 20, n: int = 2000, others: int = 48_000) -> Non
     for i in range(keys):
         one, two = (largest(detectors, jax.random.fold_in(jax.random.key(34), 2 * i + part), n) for part in (0, 1))
         for d in range(2):
-            h = np.array([threshold_of(one[m::2, d], 0.1)[0] for m in range(2)])
+            h = np.array([threshold_of(one[m::2, d], 0.1, WORLD.window)[0] for m in range(2)])
             alarms = lambda peak, h=h, d=d: int(np.sum(peak[:, d].reshape(-1, 2) > h))
-            _, low, high = rate_of(alarms(two), n)
-            covered[d] += low <= rate_of(alarms(many), others)[0] <= high
+            _, low, high = rate_of(alarms(two), n, WORLD.window)
+            covered[d] += low <= rate_of(alarms(many), others, WORLD.window)[0] <= high
     report.within(f"intervals of chi2_10 and glr that hold, of {keys}", 0.85 * keys, None, covered.tolist(), "binomial")
     r = healthy().residuals.reshape(-1, 7).astype(float)
     params = baselines.glr_params(r.T @ r / len(r), bank.laws(), baselines.LAGS[:-1])
@@ -462,7 +464,7 @@ def coverage(report, keys: int = 20, n: int = 2000, others: int = 48_000) -> Non
         jax.random.key(35),
         list(CELLS)[:3],
     )
-    h, errors = [[threshold_of(peak, 0.1)[0]] * 2 for peak in largest(pair, key, 4000).T], []
+    h, errors = [[threshold_of(peak, 0.1, WORLD.window)[0]] * 2 for peak in largest(pair, key, 4000).T], []
     for days in (256, 1024):
         f = [run_days(WORLD, pair, key, worlds.days(WORLD, key, np.arange(days), cell), threshold=h) for cell in cells]
         first, punctual = (np.stack([getattr(found, name) for found in f]) for name in ("first", "punctual"))

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from test_yardstick import MINE, WORLD, made_up
 
-from jaxatt.yardstick import Verdict, calibrate, calibration, rank, ranking, rules
+from jaxatt.yardstick import WORLDS, Verdict, calibrate, calibration, rank, ranking, rules
 from jaxatt.yardstick.harness import Softly
 
 PASSED = rules.Checks(True, True, True, True, True, 10.0)
@@ -34,7 +34,7 @@ def softly(world, rows, key, days, numbers, params_of, **_):
 def asked(verb, runner, **arguments):
     with (
         patch.object(calibration, "run", runner), patch.object(ranking, "run", runner),
-        patch.object(calibration, "slopes", softly), patch.object(rules, "checked", lambda d: PASSED),
+        patch.object(calibration, "slopes", softly), patch.object(rules, "checked", lambda *_: PASSED),
     ):  # fmt: skip
         return verb(**arguments)
 
@@ -45,7 +45,7 @@ detectors = st.one_of(
 runner = st.sampled_from([made_up, made_up, half_nan])
 hours = st.one_of(st.just(100.0), good(100, 300), plain(), odd, junk)
 keys = st.sampled_from([jax.random.key(0), jax.random.PRNGKey(1), jax.random.split(jax.random.key(0)), jax.random.key(0, impl="rbg"), 7, None, "key"])  # fmt: skip
-worlds = st.one_of(st.just(WORLD), junk)
+worlds = st.one_of(st.just(WORLD), st.just(WORLDS["microsat"]), junk)
 sizes = st.one_of(good(0.1, 5), odd, junk, st.just((1.0, 2.0)), arrays())
 cells = st.lists(st.one_of(st.tuples(st.sampled_from(["gyro_bias", "star_bias", "wheel_loss", "gyro_bias+wheel_offset", "none", 3, None]), sizes), st.none(), junk), max_size=3)  # fmt: skip
 gradients = st.one_of(

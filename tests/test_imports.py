@@ -36,9 +36,9 @@ def may_import(name):
     said = None
     for of in (name, name.rpartition(".")[0]):
         text = ast.get_docstring(ast.parse(MODULES[of].read_text())) or ""
-        said = said or (of and re.search(r"ay import: ([\w, \n]+)\.$", text))
+        said = said or (of and re.search(r"ay import: ([\w., \n]+)\.$", text))
     assert said, f"{name} does not say what it may import"
-    words = [] if said[1] == "nothing of ours" else re.findall(r"\w+", said[1])
+    words = [] if said[1] == "nothing of ours" else re.findall(r"[\w.]+", said[1])
     return set().union(*(resolved(word, name) for word in words))
 
 
@@ -85,7 +85,8 @@ def test_what_a_module_may_import_exists_and_there_are_no_circles():
 def test_figures_and_loops_are_on_top_and_the_engine_knows_no_spacecraft():
     for name in LEAVES:
         top = {module.split(".")[0] for module in may_import(name)}
-        assert ("plot" not in top or name == "view") and "view" not in top and "loops" not in top, name
+        assert ("plot" not in top or name == "view") and "view" not in top, name
+        assert "loops" not in top or name.startswith("yardstick.microsat"), name  # a world of the yardstick is a loop
     kernel = {"check", "clock", "fields", "contract", "compiling", "noise"}
     assert may_import("engine") <= kernel and may_import("sweeping") <= kernel | {"engine", "scores"}
 

@@ -17,8 +17,9 @@ from jaxatt.yardstick import (
     calibrate,
     calibration,
     descent,
-    harness,
+    kinds,
     leo4,
+    leo4_days,
     metrics,
     oracle,
     rank,
@@ -186,10 +187,10 @@ def test_days_are_the_same_in_all_cells_but_for_the_fault():
         for name in day._fields:
             if name not in ("gyro", "star", "wheel", "box"):
                 assert all(np.array_equal(a, b) for a, b in zip(*(jax.tree.leaves(getattr(d, name)) for d in (healthy, day)))), name  # fmt: skip
-        onset, truth = worlds.onset_of(day), worlds.true_channels(day)
+        onset, truth = worlds.onset_of(WORLD, day), worlds.true_channels(WORLD, day)
         assert (onset >= 0).all() and (onset < 540).all() and np.ptp(onset) > 400
         assert set(truth.sum(1)) == {3 if cell[0].startswith("star") else len(cell[0].split("+"))}
-    assert np.isinf(worlds.onset_of(healthy)).all() and set(healthy.mode) == {0.0, 1.0}
+    assert np.isinf(worlds.onset_of(WORLD, healthy)).all() and set(healthy.mode) == {0.0, 1.0}
     pair = worlds.days(WORLD, KEY, numbers, ("gyro_bias+gyro_bias", (1.0, 2.0)))
     sizes = np.sort(np.abs(pair.gyro.bias) / leo4.SECOND, axis=1)
     np.testing.assert_allclose(sizes, np.tile([0, 0, 1, 2], (64, 1)), rtol=1e-5)
@@ -211,7 +212,7 @@ def test_an_intermittent_fault_comes_every_five_seconds():
 @pytest.mark.parametrize("cell", ["gyro_bias", ("gyro_bias",), ("no_fault", 1.0), ("gyro_bias", -1.0), ("gyro_bias+star_bias", (1.0,))])  # fmt: skip
 def test_what_is_no_cell_is_refused(cell):
     with pytest.raises((ValueError, TypeError), match="`cell` must"):
-        worlds.effects(cell)
+        kinds.effects(cell)
 
 
 # detectors
@@ -278,7 +279,7 @@ def test_the_bank_adds_up_what_its_filters_believe():
 
 def test_no_detector_can_pass_the_oracle_which_has_its_closed_form():
     np.testing.assert_allclose([oracle.bound(kind) for kind in oracle.STEPS], [2.69, 20.4, 0.143], rtol=0.01)
-    found = [oracle.delay("star_bias", size) for size in worlds.SIZED["star_bias"]]
+    found = [oracle.delay("star_bias", size) for size in leo4_days.SIZED["star_bias"]]
     np.testing.assert_allclose(found, [58.0, 53.4, 36.0, 8.15, 1.41, 0.55, 0.26, 0.25], rtol=0.02)
 
 
@@ -318,7 +319,7 @@ def test_ranks_follow_holm_and_copies_tie():
 
 def test_weights_are_means_over_sizes_kinds_and_units():
     cells = [(kind, size) for kind, sizes in worlds.CATALOGUE["leo4"].items() for size in sizes]
-    weights = metrics.weights_of(cells, worlds.SIZED)
+    weights = metrics.weights_of(cells, leo4_days.SIZED)
     assert weights.sum() == pytest.approx(1) and len(cells) == 83 and np.count_nonzero(weights) == 64
     assert weights[[kind == "star_bias" for kind, _ in cells]].sum() == pytest.approx(1 / 6)
 
@@ -332,9 +333,9 @@ def test_uneven_alarms_are_found_out_and_even_ones_are_not():
 
 def test_a_threshold_is_the_quantile_of_run_maxima():
     maxima = np.random.default_rng(7).exponential(size=20_000)
-    h, low, high = calibration.threshold_of(maxima, 0.1)
+    h, low, high = calibration.threshold_of(maxima, 0.1, 600.0)
     assert low < h < high and h == pytest.approx(-np.log(1 - np.exp(-1 / 60)), rel=0.05)
-    rate, least, most = calibration.rate_of(200, 12_000)
+    rate, least, most = calibration.rate_of(200, 12_000, 600.0)
     assert least < rate < most and rate == pytest.approx(0.1008, rel=1e-3)
 
 
@@ -350,7 +351,7 @@ def test_a_gradient_at_a_fixed_rate_is_that_of_central_differences():
 def test_the_slope_of_a_threshold_is_that_of_the_maxima_next_to_it():
     rng = np.random.default_rng(8)
     maxima = rng.exponential(size=4000)
-    h, *_ = calibration.threshold_of(maxima, 1.0)
+    h, *_ = calibration.threshold_of(maxima, 1.0, 600.0)
     slope, error = calibration.threshold_slope(maxima, np.stack([maxima, np.ones(4000)], 1), h)
     np.testing.assert_allclose(slope, [h, 1.0], atol=3 * error[0])  # M = x M0 has dh/dx = h
     assert error[1] == 0
@@ -361,11 +362,11 @@ def scaled(x):
 
 
 @pytest.mark.short
-def test_slopes_of_a_score_that_is_scaled_are_the_score(monkeypatch):
-    monkeypatch.setattr(harness, "PACKETS", 700)
+def test_slopes_of_a_score_that_is_scaled_are_the_score():
+    brief = WORLD._replace(window=50.0)
     days = worlds.days(WORLD, KEY, np.arange(4), ("star_bias", 65.2))
     days = days._replace(star=days.star._replace(onset=np.where(np.isfinite(days.star.onset), 310.0, np.inf)))
-    told, moved = slopes(WORLD, [MINE], KEY, days, [1.0], scaled, threshold=[[40.0, 40.0]], width=4.0)
+    told, moved = slopes(brief, [MINE], KEY, days, [1.0], scaled, threshold=[[40.0, 40.0]], width=4.0)
     assert told.peak.shape == (4, 1) and moved.peak.shape == (4, 1, 3)
     np.testing.assert_allclose(moved.peak[..., 0], told.peak, rtol=1e-5)
     assert not moved.peak[..., 1:].any()
@@ -373,7 +374,7 @@ def test_slopes_of_a_score_that_is_scaled_are_the_score(monkeypatch):
     assert (hold[::2] > 0).all() and (slew[1::2] > 0).all() and not hold[1::2].any() and not slew[::2].any()
     assert (told.delay > 0).all() and (told.delay < 10).all()
     # x s - h = x (s - h / x): the delay at (x, h) is that at (1, h / x) of a width over x
-    more, _ = slopes(WORLD, [MINE], KEY, days, [1.25], scaled, threshold=[[50.0, 50.0]], width=5.0)
+    more, _ = slopes(brief, [MINE], KEY, days, [1.25], scaled, threshold=[[50.0, 50.0]], width=5.0)
     np.testing.assert_allclose(more.delay, told.delay, rtol=1e-3)
 
 
@@ -452,10 +453,13 @@ def test_a_detector_with_a_callback_is_not_pure_and_its_numbers_change_the_key()
         jax.debug.callback(lambda a: None, z)
         return nis_step(params, z, telemetry)
 
-    assert rules.pure(MINE) and not rules.pure(MINE._replace(step=told))
+    record = WORLD.example()
+    assert rules.pure(MINE, record) and not rules.pure(MINE._replace(step=told), record)
     other = MINE._replace(params=np.float32(1.0))
-    assert rules.digest(MINE) == rules.digest(MINE._replace(name="other")) != rules.digest(other)
-    seeds = {rules.seed_of(WORLD, [d], "1") for d in (MINE, other, MINE._replace(name="other"))}
+    assert (
+        rules.digest(MINE, record) == rules.digest(MINE._replace(name="other"), record) != rules.digest(other, record)
+    )
+    seeds = {rules.seed_of(WORLD, [d], "1", record) for d in (MINE, other, MINE._replace(name="other"))}
     assert len(seeds) == 3
 
 
@@ -465,10 +469,10 @@ def test_the_harness_reports_what_the_telemetry_says():
     flat = baselines.REFERENCE[3]
     found = run(WORLD, [MINE, flat], KEY, days, threshold=[[40.0, 40.0], [1.5, 1.5]], excess=[2e-3, 2e-3])
     assert {a.dtype for a in jax.tree.leaves(found) if a.dtype.kind == "f"} == {np.dtype(np.float32)}
-    onset = worlds.onset_of(days)
+    onset = worlds.onset_of(WORLD, days)
     for i in range(2):
-        log = rerun(leo4.system, short(leo4.params), days, KEY, i, ticks=worlds.PACKETS)
-        score, t = np.zeros(worlds.PACKETS), 0.5 * (np.arange(worlds.PACKETS) + 1) - worlds.WARMUP
+        log = rerun(leo4.system, short(leo4.params), days, KEY, i, ticks=WORLD.packets)
+        score, t = np.zeros(WORLD.packets), 0.5 * (np.arange(WORLD.packets) + 1) - WORLD.warmup
         for k, nu in enumerate(np.asarray(log.telemetry.innovation, float)):
             score[k] = 0.9 * (score[k - 1] if k else 0) + nu @ nu / leo4.STD_INNOVATION**2
         inside, after = t > 0, t > onset[i]
@@ -478,8 +482,11 @@ def test_the_harness_reports_what_the_telemetry_says():
         delay = t[hits[0]] - onset[i] if len(hits) else np.inf
         assert found.first[i, 0] == pytest.approx(delay, abs=1e-3)
         assert found.punctual[i, 0] == ~np.any((score > 40) & inside & ~after)
-        assert 0 < found.first[i, 1] <= 1.5 and found.at_alarm[i, 1].argmax() == worlds.true_channels(days)[i].argmax()
-        ticks = np.arange(5 * worlds.PACKETS) * 0.1 - worlds.WARMUP
+        assert (
+            0 < found.first[i, 1] <= 1.5
+            and found.at_alarm[i, 1].argmax() == worlds.true_channels(WORLD, days)[i].argmax()
+        )
+        ticks = np.arange(5 * WORLD.packets) * 0.1 - WORLD.warmup
         stop = min(onset[i] + found.first[i, 1], onset[i] + 60)
         beyond = np.maximum(np.ravel(log.pointing) - 2e-3, 0) * ((ticks >= onset[i]) & (ticks < stop))
         assert found.excess[i, 1] == pytest.approx(0.1 * beyond.sum(), abs=1e-5)
@@ -491,11 +498,11 @@ def short(tree):
 
 def made_up(world, rows, key, days, *, threshold=None, excess=None, progress=False):
     """Days of which the first row finds every fault in 5 s, the second in 50 s, the others nothing."""
-    n, d = len(days.mode), len(rows)
+    n, d = len(jax.tree.leaves(days)[0]), len(rows)
     rng = np.random.default_rng(int(jax.random.key_data(key)[-1]) % 2**31)
-    faulty = np.isfinite(worlds.onset_of(days))[:, None]
+    faulty = np.isfinite(worlds.onset_of(world, days))[:, None]
     delays = np.array([5.0, 50.0, *[np.inf] * (d - 2)]) + rng.uniform(-1, 1, (n, d))
-    blame = np.zeros((n, d, 11)) + 0.01 + worlds.true_channels(days)[:, None]
+    blame = np.zeros((n, d, world.channels)) + 0.01 + worlds.true_channels(world, days)[:, None]
     hit = np.isfinite(delays) & faulty
     return Found(
         peak=rng.exponential(size=(n, d)), first=np.where(hit, delays, np.inf), punctual=np.ones((n, d), bool),
@@ -508,8 +515,8 @@ def made_up(world, rows, key, days, *, threshold=None, excess=None, progress=Fal
 def test_a_ranking_of_made_up_days_says_what_they_hold(monkeypatch, tmp_path):
     monkeypatch.setattr(ranking, "run", made_up)
     monkeypatch.setattr(calibration, "run", made_up)
-    monkeypatch.setattr(rules, "checked", lambda d: rules.Checks(True, True, True, True, True, 10.0))
-    deaf = Detector("deaf", lambda params: (), baselines.random_step)
+    monkeypatch.setattr(rules, "checked", lambda *_: rules.Checks(True, True, True, True, True, 10.0))
+    deaf = Detector("deaf", lambda params: (), baselines.REFERENCE[1].step)
     board = rank([MINE, deaf], days=16, hours=400)
     mine, other = board.rows[:2]
     assert (mine["name"], mine["rank"], other["name"], other["rank"]) == ("mine", 1, "deaf", 2)
@@ -525,14 +532,14 @@ def test_a_ranking_of_made_up_days_says_what_they_hold(monkeypatch, tmp_path):
     assert again == board and differences(again, rank([MINE, deaf], days=16, hours=400)) == []
     assert "mine" in board.table() and len(board.figure().axes) == 2 and "mine" in board.cards()
     with pytest.raises(ValueError, match="pass the checks of the yardstick, but it is not causal"):
-        monkeypatch.setattr(rules, "checked", lambda d: rules.Checks(False, True, True, True, True, 10.0))
+        monkeypatch.setattr(rules, "checked", lambda *_: rules.Checks(False, True, True, True, True, 10.0))
         rank([MINE], days=16, hours=400)
 
 
 def test_the_command_rebuilds_a_board_and_says_where_it_differs(monkeypatch, tmp_path, capsys):
     for module in (ranking, calibration):
         monkeypatch.setattr(module, "run", made_up)
-    monkeypatch.setattr(rules, "checked", lambda d: rules.Checks(True, True, True, True, True, 10.0))
+    monkeypatch.setattr(rules, "checked", lambda *_: rules.Checks(True, True, True, True, True, 10.0))
     monkeypatch.setattr(command, "configure", lambda: None)
     board, path = rank([tune("chi2_10"), tune("mrp")], days=16, hours=100, cells=[("gyro_bias+wheel_offset", (1.0, 2.0)), ("star_bias", 5)]), tmp_path / "b.json"  # fmt: skip
     board.to_json(path)

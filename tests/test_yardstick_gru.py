@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxatt.yardstick import bank, baselines, gru, learning, leo4, recording, rules, tune, worlds
+from jaxatt.yardstick import bank, baselines, gru, learning, leo4, leo4_days, recording, rules, tune, worlds
 from jaxatt.yardstick.learning import Days, Plan, Stretch, train
 from jaxatt.yardstick.telemetry import STD
 
@@ -33,10 +33,10 @@ def test_the_shipped_unit_is_that_of_the_equations_alone_and_in_a_batch_and_as_i
     row = tune("gru")
     params = jax.tree.map(lambda a: a.astype(float), row.params)
     assert gru.WEIGHTS.stat().st_size < 100_000 and all(np.isfinite(a).all() for a in params)
-    assert row.tuned == sum(a.size for a in params[1:]) and rules.pure(row)
+    assert row.tuned == sum(a.size for a in params[1:]) and rules.pure(row, leo4_days.example())
     r = np.random.default_rng(0).normal(size=(70, 7, 3)) * np.array(STD)[:, None]
     r[40:, 3, 1] += 3 * STD[3]  # a gyro's bias, as the parity sees it
-    step = lambda h, r: gru.gru_step(params, h, r, rules.example())
+    step = lambda h, r: gru.gru_step(params, h, r, leo4_days.example())
     told = jax.lax.scan(jax.vmap(step, in_axes=-1, out_axes=-1), jnp.zeros((32, 3)), r)[1]
     alone = jax.lax.scan(step, jnp.zeros(32), r[..., 2])[1]
     np.testing.assert_allclose(told.score[..., 2], alone.score, rtol=1e-9, atol=1e-9)
@@ -63,15 +63,15 @@ def test_the_shipped_unit_is_that_of_the_equations_alone_and_in_a_batch_and_as_i
 def made_up(key, n):
     """White residuals whose parity jumps at the onset, gyro 1 at fault."""
     rng = np.random.default_rng(int(jax.random.key_data(key)[-1]))
-    r, onset = rng.normal(size=(n, worlds.PACKETS, 7)).astype(np.float32), rng.integers(600, 1680, n)
-    r[..., 3] += 2 * (np.arange(worlds.PACKETS) >= onset[:, None])
+    r, onset = rng.normal(size=(n, leo4_days.PACKETS, 7)).astype(np.float32), rng.integers(600, 1680, n)
+    r[..., 3] += 2 * (np.arange(leo4_days.PACKETS) >= onset[:, None])
     return Days(r, onset, np.tile(np.arange(11) == 1, (n, 1)))
 
 
 def test_stretches_are_days_from_first_to_last_packet():
     plan = Plan(days=50, passes=2, batch=18)
     days = made_up(jax.random.key(0), 50)
-    days.r[..., 0] = np.arange(worlds.PACKETS)  # the packet's number
+    days.r[..., 0] = np.arange(leo4_days.PACKETS)  # the packet's number
     days.r[..., 1] = np.arange(50)[:, None]
     days.onset[:10] = learning.NEVER
     told = list(learning.stretches(days, plan, np.random.default_rng(2)))
@@ -118,13 +118,13 @@ def test_a_drawn_day_is_one_of_the_public_catalogue_with_its_onset_and_channel(m
     monkeypatch.setattr(recording, "residuals_of", lambda days, key: days)
     found = learning.drawn(jax.random.key(4), 256)
     days = found.r
-    onset = np.floor((worlds.onset_of(days) + 300) / 0.5)
+    onset = np.floor((worlds.onset_of(worlds.WORLDS["leo4"], days) + 300) / 0.5)
     assert 0.1 < np.mean(np.isinf(onset)) < 0.3
     np.testing.assert_array_equal(found.onset, np.where(np.isinf(onset), learning.NEVER, onset))
-    assert set(found.channels[np.isfinite(worlds.onset_of(days))].sum(1)) == {1, 3}
+    assert set(found.channels[np.isfinite(worlds.onset_of(worlds.WORLDS["leo4"], days))].sum(1)) == {1, 3}
     bias = np.abs(days.gyro.bias[np.isfinite(days.gyro.onset)]) / leo4.SECOND
     sizes = np.unique(bias[bias > 0])
-    assert len(sizes) > 5 and all(np.isclose(s, worlds.SIZED["gyro_bias"], rtol=1e-4).any() for s in sizes)
+    assert len(sizes) > 5 and all(np.isclose(s, leo4_days.SIZED["gyro_bias"], rtol=1e-4).any() for s in sizes)
 
 
 @pytest.mark.short

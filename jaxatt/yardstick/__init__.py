@@ -9,13 +9,17 @@ A detector is two functions of one packet of telemetry (`Detector`). `rank` chec
 alarms an hour in each mode, and meets it with every fault of the catalogue on days that nobody has seen. The rules on one
 screen: docs/yardstick.md. ``python -m jaxatt.yardstick board.json`` rebuilds a board and compares it.
 
+The second world is a satellite that unloads its wheels and watches itself; its baselines are `MICROSAT_ROWS`.
+
+    board = rank([MICROSAT_ROWS["cusum"], mine], WORLDS["microsat"])
+
 A controller is two functions too, of one reading (`Controller`). `control` lets each hold an attitude with the same faults of
 wheels; `CONTROLLERS` holds the baselines, `CELLS` the faults.
 
     board = control([CONTROLLERS["pid"], CONTROLLERS["structured"], mine])
 
 Its modules may import: yardstick, check, fields, clock, contract, compiling, vec, attitude, faults, noise, engine,
-sweeping, scores, soft_scores, loss, detection, filters, batching, resuming.
+sweeping, scores, soft_scores, loss, detection, filters, batching, resuming, loops.microsat.
 """
 
 from functools import cache
@@ -28,6 +32,7 @@ from jaxatt.yardstick.controllers import CONTROLLERS
 from jaxatt.yardstick.descent import at_fixed_rate
 from jaxatt.yardstick.fitting import NAMES, tune
 from jaxatt.yardstick.leo4 import Reading, Telemetry
+from jaxatt.yardstick.microsat_rows import MICROSAT_ROWS
 from jaxatt.yardstick.ranking import rank
 from jaxatt.yardstick.telemetry import Detector, Residuals, Verdict, residuals_init, residuals_step
 from jaxatt.yardstick.worlds import CATALOGUE, WORLDS, World
@@ -36,6 +41,7 @@ __all__ = [
     "CATALOGUE",
     "CELLS",
     "CONTROLLERS",
+    "MICROSAT_ROWS",
     "NAMES",
     "WORLDS",
     "Board",

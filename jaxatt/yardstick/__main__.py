@@ -2,7 +2,7 @@
 
 Of detectors or of controllers; the rows must be baselines. Says where the new board differs, and returns 1 if it does.
 
-May import: board, control, controllers, fitting, ranking, worlds, compiling.
+May import: board, control, controllers, fitting, microsat_rows, ranking, worlds, compiling.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from jaxatt.yardstick.board import Board, differences
 from jaxatt.yardstick.control import ControlBoard, control
 from jaxatt.yardstick.controllers import CONTROLLERS
 from jaxatt.yardstick.fitting import NAMES, tune
+from jaxatt.yardstick.microsat_rows import MICROSAT_ROWS
 from jaxatt.yardstick.ranking import rank
 from jaxatt.yardstick.worlds import WORLDS
 
@@ -29,7 +30,8 @@ def main(arguments: list[str] | None = None) -> int:
     before = Board.from_json(args.board)
     h = before.header
     driven = h.get("track") == "control"
-    known, names = (CONTROLLERS, h["controllers"]) if driven else (NAMES, h["detectors"])
+    rows = MICROSAT_ROWS if h["world"] == "microsat" else NAMES
+    known, names = (CONTROLLERS, h["controllers"]) if driven else (rows, h["detectors"])
     unknown = [name for name in names if name not in known]
     if unknown or h["seed"] is None:
         parser.error(
@@ -40,7 +42,8 @@ def main(arguments: list[str] | None = None) -> int:
         return told(before, control(rows, WORLDS[h["world"]], n=h["n"], deciles=h["deciles"]))
     cells = None if h["cells"] is None else [(k, tuple(s) if isinstance(s, list) else s) for k, s in h["cells"]]
     how = {"ruleset": h["ruleset"], "days": h["days"], "hours": h["hours"], "cells": cells}
-    return told(before, rank([tune(name) for name in names], WORLDS[h["world"]], **how, progress=True))
+    row = MICROSAT_ROWS.__getitem__ if rows is MICROSAT_ROWS else tune
+    return told(before, rank([row(name) for name in names], WORLDS[h["world"]], **how, progress=True))
 
 
 def told(before: Board, now: Board | ControlBoard) -> int:

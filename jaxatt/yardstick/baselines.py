@@ -2,12 +2,11 @@
 
 z = L^-1 r of the residuals r (`telemetry.residuals_step`), L L' = Sigma, their covariance in healthy runs.
 
-May import: leo4, telemetry, products, vec, attitude, batching, detection.
+May import: leo4, leo4_days, telemetry, references, products, vec, attitude, detection.
 """
 
 from __future__ import annotations
 
-from functools import cache
 from typing import Any, NamedTuple
 
 import jax
@@ -15,12 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxatt.attitude import mrp_from_quat, mrp_rate, mrp_rate_transposed
-from jaxatt.batching import in_lanes
-from jaxatt.detection import Cusum, chi_square, cusum, smoothed, window_sum
+from jaxatt.detection import Cusum, chi_square, cusum, smoothed
 from jaxatt.vec import Quat, Vec3, cross, norm
-from jaxatt.yardstick import leo4
+from jaxatt.yardstick import leo4, leo4_days
 from jaxatt.yardstick.leo4 import Telemetry
 from jaxatt.yardstick.products import correlations, product, pushed
+from jaxatt.yardstick.references import references, summed, window_of
 from jaxatt.yardstick.telemetry import (
     Detector,
     OnResiduals,
@@ -30,12 +29,12 @@ from jaxatt.yardstick.telemetry import (
 )
 
 LAGS = (1, 2, 4, 8, 16, 32, 64, 128)  # [packets] of the GLR
-ALL = np.ones(11)
+CHANNELS = sum(leo4_days.UNITS.values())
 
 
 def everyone(like):
     """The blame of a detector that cannot tell."""
-    return jnp.ones(11, like.dtype)
+    return jnp.ones(CHANNELS, like.dtype)
 
 
 # the published observer
@@ -88,17 +87,6 @@ def mrp_step(params: ObserverParams, z: Observer, telemetry: Telemetry) -> tuple
 
 
 # chi-square of the MEKF's innovation
-
-
-def summed(line, new):
-    """The window (N, ...) of the latest with one more, and its sum: `detection.window_sum` with a batch left where it is."""
-    return in_lanes(window_sum, line, new)
-
-
-@cache
-def window_of(packets: int):
-    """The init of a window of so many packets, or of as many means."""
-    return lambda params: jnp.zeros(packets)
 
 
 def chi2_step(params, z, telemetry: Telemetry):
@@ -275,43 +263,7 @@ def pca_step(params: PcaParams, recent, r, telemetry: Telemetry):
     return recent, Verdict(score, blame(*parts))
 
 
-# reference rows
-
-
-def null_step(params, z, telemetry: Telemetry):
-    """Never alarms."""
-    score = 0 * telemetry.innovation[0]
-    return z, Verdict(score, everyone(score))
-
-
-def random_step(params, z, telemetry: Telemetry):
-    """A hash of the packet's bits, uniform in [0, 1)."""
-    words = jax.lax.bitcast_convert_type(telemetry.gyro.astype(jnp.float32).reshape(-1), jnp.uint32)
-    h = jnp.uint32(2166136261)
-    for i in range(leo4.TICKS * 4):
-        h = (h ^ words[i]) * jnp.uint32(16777619)
-        h = h ^ (h >> 15)
-    h = (h ^ (h >> 13)) * jnp.uint32(0xC2B2AE35)
-    score = ((h ^ (h >> 16)) >> 8).astype(telemetry.gyro.dtype) * 2.0**-24
-    return z, Verdict(score, everyone(score))
-
-
-class Clock(NamedTuple):
-    """The window of chi2_10 and how many packets have come."""
-
-    recent: Any
-    seen: Any
-
-
-def clock_init(params) -> Clock:
-    return Clock(jnp.zeros(10), jnp.zeros(()))
-
-
-def clock_step(params, z: Clock, telemetry: Telemetry):
-    """chi2_10 that counts packets and alarms in the first third of the window alone: what the onset law must not reward."""
-    recent, verdict = chi2_step(params, z.recent, telemetry)
-    first = (z.seen >= 600) & (z.seen < 1000)
-    return Clock(recent, z.seen + 1), Verdict(jnp.where(first, verdict.score, 0), verdict.blame)
+# readings that repeat themselves
 
 
 class Flat(NamedTuple):
@@ -357,15 +309,8 @@ def parity(packets: int, std) -> Detector:
     return Detector(name, with_residuals(window_of(packets)), OnResiduals(parity_step), np.float32(std), 1)
 
 
-def nothing(params):
-    """No state."""
-    return ()
-
-
 MRP = Detector("mrp", mrp_init, mrp_step, ObserverParams(*map(np.float32, ObserverParams())), 3)
 REFERENCE = (
-    Detector("null", nothing, null_step),
-    Detector("random", nothing, random_step),
-    Detector("clock", clock_init, clock_step, np.float32(S), 1),
+    *references(CHANNELS, chi2(10), *(round(s / leo4.PACKET) for s in (leo4_days.WARMUP, leo4_days.WINDOW))),
     Detector("flatline", flat_init, flat_step),
 )

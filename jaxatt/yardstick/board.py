@@ -1,6 +1,6 @@
 """The board: what a ranking found, as a table, a figure and plain values that go to JSON and back.
 
-May import: worlds, metrics, check.
+May import: check.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxatt import check
-from jaxatt.yardstick import worlds
 
 VERSION = "1"
 MACHINE = ("seconds", "machine", "nanoseconds")  # fields of a card that another machine changes
@@ -47,21 +46,31 @@ class Board(NamedTuple):
 
     def table(self) -> str:
         """The board as text: one line a row, the reference rows last."""
-        head = f"{'':3} {'row':12} {'macro s':>13} {'gyro':>6} {'star':>6} {'wheel':>6} {'P10 %':>6} {'P60 %':>6} {'alarms/h hold slew':>19} {'mismatch/h':>22} {'isolation':>9} {'held out':>8} {'ns':>6}  notes"  # fmt: skip
+        of, modes = self.units(), " ".join(dict.fromkeys(mode for row in self.rows for mode in row["rate"]))
+        names, rate = " ".join(f"{unit:>6}" for unit in of), f"alarms/h {modes}"
+        head = f"{'':3} {'row':12} {'macro s':>13} {names} {'P10 %':>6} {'P60 %':>6} {rate:>19} {'mismatch/h':>22} {'isolation':>9} {'held out':>8} {'ns':>6}  notes"  # fmt: skip
         lines = [self._title(), head]
         for row in self.rows:
             rank = f"{row['rank']}{'=' if row['tied'] else ''}" if row["rank"] else "-"
-            units = " ".join(fixed(row["units"].get(unit), 6, 1) for unit in worlds.UNITS)
+            units = " ".join(fixed(row["units"].get(unit), 6, 1) for unit in of)
             rates = " ".join(fixed(r[0], 9, 3) for r in row["rate"].values()) or f"{'':19}"
             worst = row["robustness"]
-            robust = f"{fixed(worst.get('rate'), 6, 1)} {worst.get('world', '')[5:][:15]:15}" if worst else f"{'':22}"
+            robust = (
+                f"{fixed(worst.get('rate'), 6, 1)} {worst.get('world', '').removeprefix(self.header['world'] + ' ')[:15]:15}"
+                if worst
+                else f"{'':22}"
+            )
             macro = f"{fixed(row['macro'], 6, 2)} +-{fixed(row['macro_se'], 5, 2)}"
             lines.append(
-                f"{rank:3} {row['name']:12} {macro:>13} {units} {fixed(row['p10'], 6, 1)} {fixed(row['p60'], 6, 1)} {rates:>19} "
+                f"{rank:3} {row['name']:12} {macro:>13} {units} {fixed(row['p10'], 6, 1)} {fixed(row['p60'], 6, 1)} {rates:>{len(rate)}} "
                 f"{robust:22} {fixed(row['isolation'].get('at_alarm'), 9, 2)} {fixed(row['held_out'], 8, 1)} "
                 f"{fixed(row['nanoseconds'], 6, 0)}  {', '.join(row['notes'])}".rstrip()
             )
         return "\n".join(lines)
+
+    def units(self) -> list[str]:
+        """The units whose sized kinds are on the board."""
+        return list(dict.fromkeys(unit for row in self.rows for unit in row["units"]))
 
     def _title(self) -> str:
         h = self.header
@@ -74,7 +83,9 @@ class Board(NamedTuple):
         ranked = [row for row in self.rows if row["rank"]]
         fig, (left, right) = plt.subplots(1, 2, figsize=(11, 0.42 * len(ranked) + 2.2), layout="constrained")
         y = np.arange(len(ranked))
-        for i, (unit, colour, mark) in enumerate(zip(worlds.UNITS, ("#0072B2", "#D55E00", "#009E73"), "os^")):
+        for i, (unit, colour, mark) in enumerate(
+            zip(self.units(), ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00"), "os^Dv")
+        ):
             values = [row["units"].get(unit) for row in ranked]
             left.plot(values, y, mark, color=colour, label=unit, markersize=6, alpha=0.9, zorder=3 + i)
         left.barh(y, [row["macro"] for row in ranked], color="0.85", label="macro", zorder=1)
@@ -84,7 +95,7 @@ class Board(NamedTuple):
         left.invert_yaxis()
         left.set_xlim(0, 62)
         left.set_xlabel("restricted mean delay, RMD60 [s]")
-        left.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=4, frameon=False, fontsize=8)
+        left.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=len(self.units()) + 1, frameon=False, fontsize=8)
         names = [row["name"] for row in ranked]
         values = np.array([[cell[name][0] if name in cell else np.nan for name in names] for cell in self.cells.values()], float)  # fmt: skip
         factors = np.geomspace(1, 60, 200)

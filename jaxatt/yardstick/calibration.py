@@ -1,6 +1,6 @@
 """Thresholds of a stated false-alarm rate, mode by mode, and what rate fresh windows show.
 
-The rate r belongs to windows of T = 600 s: P(no alarm in T) = exp(-r T). The threshold is that quantile of the largest
+The rate r belongs to windows of T seconds, 600 in leo4: P(no alarm in T) = exp(-r T). The threshold is that quantile of the largest
 score of healthy windows, whatever the scores' correlation in time; formulas for single samples miss the rate by orders.
 It has a gradient: as the numbers of a detector change, the threshold moves with the largest scores that lie next to it.
 
@@ -22,9 +22,8 @@ from jaxatt.yardstick import worlds
 from jaxatt.yardstick.harness import Found, run, slopes
 from jaxatt.yardstick.rules import validated
 from jaxatt.yardstick.telemetry import Detector
-from jaxatt.yardstick.worlds import WINDOW, World
+from jaxatt.yardstick.worlds import World
 
-HOURS = WINDOW / 3600  # of a window
 DISTINCT = 1000  # run maxima below which a rate is an interval
 NEAREST = 0.06  # share of the windows that tell how the threshold moves: those with a largest score next to it
 
@@ -47,10 +46,10 @@ class Calibration(NamedTuple):
     slope_error: Any = None  # its standard error
 
 
-def threshold_of(maxima, rate: float) -> tuple[float, float, float]:
-    """Threshold and its 95 % interval from the largest scores of n windows: level exp(-rate T), linear between them."""
+def threshold_of(maxima, rate: float, window: float) -> tuple[float, float, float]:
+    """Threshold and its 95 % interval from the largest scores of n windows [s]: level exp(-rate T), linear between them."""
     maxima = np.sort(np.where(np.isnan(maxima), np.inf, maxima).astype(float))
-    n, level = len(maxima), np.exp(-rate * HOURS)
+    n, level = len(maxima), np.exp(-rate * (window / 3600))
     spread = 1.96 * np.sqrt(n * level * (1 - level))
     at = np.clip(np.array([n * level - spread, n * level + spread]).round().astype(int), 0, n - 1)
     with np.errstate(invalid="ignore"):
@@ -86,17 +85,19 @@ def threshold_slopes(peaks, moved, thresholds) -> tuple[np.ndarray, np.ndarray]:
     return slope, error
 
 
-def rate_of(k, n) -> tuple[Any, Any, Any]:
-    """Alarms per hour and their 95 % interval from k of n windows with an alarm: -ln(1 - k / n) / T."""
+def rate_of(k, n, window: float) -> tuple[Any, Any, Any]:
+    """Alarms per hour and their 95 % interval from k of n windows [s] with an alarm: -ln(1 - k / n) / T."""
     with np.errstate(divide="ignore"):
-        return tuple(-np.log1p(-np.asarray(share, float)) / HOURS for share in (np.divide(k, n), *wilson(k, n)))  # pyright: ignore[reportReturnType]
+        return tuple(
+            -np.log1p(-np.asarray(share, float)) / (window / 3600) for share in (np.divide(k, n), *wilson(k, n))
+        )  # pyright: ignore[reportReturnType]
 
 
-def windows_of(hours) -> int:
-    """Windows of so many hours, as many of each of two modes; refuses hours outside [100, 1e6]."""
+def windows_of(hours, window: float) -> int:
+    """Windows [s] of so many hours, as many of each of two modes; refuses hours outside [100, 1e6]."""
     between = "below 100 no rate of .1/h is known to a third"
     check.between("hours", check.number("hours", hours), 99.999, 1e6, between)
-    return 2 * int(np.ceil(hours / (2 * HOURS) - 1e-9))
+    return 2 * int(np.ceil(hours / (2 * (window / 3600)) - 1e-9))
 
 
 def typed(key):
@@ -130,8 +131,8 @@ def calibrate(
         `Calibration`; its ``slope`` and ``slope_error`` are None without ``gradient``.
 
     Raises:
-        ValueError: no detector, two of one name, hours outside [100, 1e6], a rate outside (0, 6), numbers of another shape than (k,).
-        TypeError: a detector whose step does not return a `Verdict` of a score () and a blame (11,); a function that
+        ValueError: no detector, two of one name, hours outside [100, 1e6], a rate outside (0, one alarm a window), numbers of another shape than (k,).
+        TypeError: a detector whose step does not return a `Verdict` of a score () and a blame (channels,); a function that
             gives no params for each detector.
 
     Example:
@@ -140,14 +141,14 @@ def calibrate(
         >>> found = calibrate(WORLDS["leo4"], [BASELINES["cusum"]], jax.random.key(7), gradient=([0.25], slack))
     """
     check.kind("world", world, World)
-    key, n, modes = typed(key), windows_of(hours), len(world.modes)
-    check.between("rate", check.number("rate", rate), 0, 6, "one alarm a window")
+    key, n = typed(key), windows_of(hours, world.window)
+    check.between("rate", check.number("rate", rate), 0, 3600 / world.window, "one alarm a window")
     if gradient is not None:
-        detectors = _with_numbers(validated(detectors), gradient)
-    detectors = validated(detectors)
+        detectors = _with_numbers(validated(detectors, world), gradient)
+    detectors = validated(detectors, world)
     healthy = windows(world, detectors, jax.random.fold_in(key, 1), n, progress)
     fresh = windows(world, detectors, jax.random.fold_in(key, 2), n, progress)
-    found = calibration(modes, healthy, fresh.peak, rate)
+    found = calibration(world, healthy, fresh.peak, rate)
     if gradient is None:
         return found
     days = worlds.days(world, jax.random.fold_in(key, 1), np.arange(n), None)
@@ -171,8 +172,9 @@ def _with_numbers(detectors: tuple[Detector, ...], gradient) -> tuple[Detector, 
     return tuple(d._replace(params=p) for d, p in zip(detectors, given))
 
 
-def calibration(modes: int, healthy: Found, fresh, rate: float) -> Calibration:
+def calibration(world: World, healthy: Found, fresh, rate: float) -> Calibration:
     """`calibrate` of windows that were run; fresh: (n, detectors) largest scores."""
+    modes, window = len(world.modes), world.window
     peak = np.asarray(healthy.peak)
     names = ("threshold", "low", "high", "rate", "rate_low", "rate_high", "distinct", "reachable_low", "reachable_high")
     rows: dict[str, list] = {name: [] for name in names}
@@ -180,10 +182,10 @@ def calibration(modes: int, healthy: Found, fresh, rate: float) -> Calibration:
         of = {name: [] for name in rows}
         for m in range(modes):
             maxima, other = peak[m::modes, d], np.asarray(fresh)[m::modes, d]
-            h, low, high = threshold_of(maxima, rate)
+            h, low, high = threshold_of(maxima, rate, window)
             k, n = np.sum(~(other <= h)), len(other)
-            values = (h, low, high, *rate_of(k, n), len(np.unique(maxima)), rate_of(np.sum(~(maxima <= h)), len(maxima))[0],
-                      rate_of(np.sum(~(maxima < h)), len(maxima))[0])  # fmt: skip
+            values = (h, low, high, *rate_of(k, n, window), len(np.unique(maxima)), rate_of(np.sum(~(maxima <= h)), len(maxima), window)[0],
+                      rate_of(np.sum(~(maxima < h)), len(maxima), window)[0])  # fmt: skip
             for name, value in zip(names, values, strict=True):
                 of[name].append(value)
         for name in of:

@@ -5,7 +5,7 @@ Plant, sensors and MEKF are those of `leo4`, of which a controller replaces `dec
 pointing error is at most .2 deg at every tick of the last 30 s. Episode i has the same body, start, noise and order of wheels
 in every cell and for every controller, so all comparisons are paired.
 
-May import: leo4, board, calibration, metrics, rules, worlds, check, contract, faults, loss, scores, sweeping, vec.
+May import: leo4, leo4_days, board, calibration, metrics, rules, worlds, check, contract, faults, loss, scores, sweeping, vec.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from jaxatt.faults import Fault
 from jaxatt.loss import wilson
 from jaxatt.sweeping import progress_bar, sweep
 from jaxatt.vec import Vec3, zeros
-from jaxatt.yardstick import leo4, metrics, rules, worlds
+from jaxatt.yardstick import leo4, leo4_days, metrics, rules, worlds
 from jaxatt.yardstick.board import Pairs, fixed, opened, plain, row_of, stored
 from jaxatt.yardstick.calibration import typed
 from jaxatt.yardstick.leo4 import Reading
@@ -95,10 +95,10 @@ def _share(u, deciles):
     return jnp.where(deciles > 1, u, tenth / 10)
 
 
-def _episode(name, spread: worlds.Spread, key, index, faults: tuple[Cell, Any]) -> leo4.Scenario:
-    """The scenario of one episode; name and spread as of `worlds.draw`."""
+def _episode(name, spread: leo4_days.Spread, key, index, faults: tuple[Cell, Any]) -> leo4.Scenario:
+    """The scenario of one episode; name and spread as of `leo4_days.draw`."""
     cell, deciles = faults
-    day = worlds.draw(name, spread, key, index)
+    day = leo4_days.draw(name, spread, key, index)
     key = jax.random.fold_in(jax.random.fold_in(jax.random.fold_in(key, np.uint32(crc32(b"control"))), name), index)
     gauss, even = jax.random.split(key)
     axis, spin = jnp.split(jax.random.normal(gauss, (6,), jnp.float32), 2)

@@ -3,7 +3,7 @@
 D(x, h(x)), the expected min(delay, 60 s) of an alarm that comes softly at the threshold h, has the gradient
 dD/dx = D_x + D_h dh/dx, with dh/dx of `calibration.threshold_slope`. Tune on faulty days, judge on fresh ones.
 
-May import: calibration, harness, metrics, telemetry, worlds, check.
+May import: calibration, harness, kinds, metrics, telemetry, worlds, check.
 """
 
 from __future__ import annotations
@@ -18,8 +18,9 @@ from jaxatt import check
 from jaxatt.yardstick import metrics, worlds
 from jaxatt.yardstick.calibration import threshold_of, threshold_slopes, typed, windows_of
 from jaxatt.yardstick.harness import slopes
+from jaxatt.yardstick.kinds import effects
 from jaxatt.yardstick.telemetry import Detector
-from jaxatt.yardstick.worlds import SIZED, World
+from jaxatt.yardstick.worlds import World
 
 WIDTH = 0.15  # of the softened alarm, over the spread of the healthy score's largest values
 
@@ -47,23 +48,23 @@ def at_fixed_rate(
         numbers: x, (k,).
         params_of: x -> (params,).
         hours: of healthy windows, both modes together.
-        days: of each of the 64 sized cells.
+        days: of each of the sized cells.
         rate: of false alarms [1/h].
 
     Example:
         >>> slack = lambda x: (cusum.params._replace(slack=x[0]),)
         >>> found = at_fixed_rate(WORLDS["leo4"], cusum, jax.random.key(0), [0.25], slack, hours=1000)
     """
-    days, key, n, modes = check.whole("days", days, 1), typed(key), windows_of(hours), len(world.modes)
+    days, key, n, modes = check.whole("days", days, 1), typed(key), windows_of(hours, world.window), len(world.modes)
     calm, test = (jax.random.fold_in(key, i) for i in (1, 3))
     told, moved = slopes(world, [detector], calm, worlds.days(world, calm, np.arange(n), None), numbers, params_of)
     maxima = [told.peak[m::modes, 0] for m in range(modes)]
-    h = [threshold_of(a, rate)[0] for a in maxima]
+    h = [threshold_of(a, rate, world.window)[0] for a in maxima]
     slope, error = (a[0] for a in threshold_slopes(told.peak, moved.peak, [h]))
     width = WIDTH * float(np.mean([np.std(a) for a in maxima]))
-    cells = [(kind, size) for kind, sizes in SIZED.items() for size in sizes]
-    weights = np.repeat(metrics.weights_of(cells, SIZED), days) / days
-    both = jax.tree.map(lambda *a: np.repeat(np.array(a, np.float32), days), *(worlds.effects(cell) for cell in cells))
+    cells = [(kind, size) for kind, sizes in world.sized.items() for size in sizes]
+    weights = np.repeat(metrics.weights_of(cells, world.sized), days) / days
+    both = jax.tree.map(lambda *a: np.repeat(np.array(a, np.float32), days), *(effects(cell) for cell in cells))
     faulty = worlds.days(world, test, np.tile(np.arange(days), len(cells)), both)
     told, moved = slopes(world, [detector], test, faulty, numbers, params_of, threshold=[h], width=width)
     here = np.einsum("n,nk->k", weights, moved.delay[:, 0])

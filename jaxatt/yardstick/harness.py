@@ -4,13 +4,13 @@ The tallies of a detector: its largest score in the window, its first alarm afte
 its blame at the alarm and ten seconds later, the pointing error until the alarm, episodes of alarms. Several detectors
 run in one sweep and cost one simulation. The score of a packet counts at its stamp, t = 0 at the window's start.
 
-May import: leo4, metrics, telemetry, worlds, compiling, contract, scores, soft_scores, sweeping.
+May import: metrics, telemetry, worlds, compiling, contract, scores, soft_scores, sweeping.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import lru_cache, partial
+from functools import lru_cache, partial, reduce
 from typing import Any, NamedTuple
 
 import jax
@@ -21,10 +21,10 @@ from jaxatt import scores, soft_scores
 from jaxatt.compiling import jitted
 from jaxatt.contract import System, no_check
 from jaxatt.sweeping import sweep
-from jaxatt.yardstick import leo4, worlds
+from jaxatt.yardstick import worlds
 from jaxatt.yardstick.metrics import HORIZON
-from jaxatt.yardstick.telemetry import Detector, OnResiduals, residuals_step
-from jaxatt.yardstick.worlds import PACKETS, WARMUP, World
+from jaxatt.yardstick.telemetry import Detector, OnResiduals
+from jaxatt.yardstick.worlds import World
 
 LATER = 10.0  # [s] after an alarm at which the blame is read again
 QUIET = 60.0  # [s] that end an episode of alarms
@@ -53,10 +53,11 @@ class Told(NamedTuple):
     t: Any  # [s] stamp in the window
     score: Any  # (detectors,)
     up: Any  # (detectors,) bool: in the window and not at or below the threshold
-    blame: Any  # (detectors, 11)
+    blame: Any  # (detectors, channels)
     alarm: Any  # (detectors,) [s] first alarm after the onset until now
     quiet: Any  # (detectors,) [s] since the last alarm before
-    pointing: Any  # (5,) [rad]
+    pointing: Any  # (ticks,) [rad]
+    mode: Any  # 0 or 1
 
 
 class Found(NamedTuple):
@@ -65,8 +66,8 @@ class Found(NamedTuple):
     peak: Any  # largest score in the window
     first: Any  # [s] from the onset to the first alarm after it
     punctual: Any  # bool: no alarm up to the onset
-    at_alarm: Any  # (11,) blame at that alarm; NaN without
-    later: Any  # (11,) ten seconds on
+    at_alarm: Any  # (channels,) blame at that alarm; NaN without
+    later: Any  # (channels,) ten seconds on
     excess: Any  # [rad s] pointing error beyond the healthy until the alarm or 60 s
     episodes: Any  # of alarms in the window
     last: Any  # score of the last packet
@@ -75,15 +76,14 @@ class Found(NamedTuple):
     pointing: Any  # [rad] at the end
 
 
-def onset(scenario: leo4.Scenario):
-    """The first onset [s] of a day, from the start of the run; inf without a fault."""
-    here = [jnp.min(fault.onset) for fault in (scenario.gyro, scenario.star, scenario.wheel)]
-    return jnp.minimum(jnp.minimum(here[0], here[1]), jnp.minimum(here[2], scenario.box.onset))
+def onset(onsets: Callable, scenario):
+    """The first onset [s] of a day, from the start of the run; inf without a fault. onsets: of the world."""
+    return reduce(jnp.minimum, [jnp.min(a) for a in onsets(scenario)])
 
 
 @lru_cache
-def watched(system: System, steps: tuple) -> System:
-    """The world's system with detectors in its tick; steps: their (init, step). Equal arguments give the same system."""
+def watched(system: System, onsets: Callable, warmup: float, steps: tuple) -> System:
+    """A world's system with detectors in its tick; steps: their (init, step). Equal arguments give the same system."""
 
     def init(params: Params, scenario):
         x, z = system.init(params.world, scenario)
@@ -97,12 +97,12 @@ def watched(system: System, steps: tuple) -> System:
         x, world, log = system.tick(params.world, scenario, now, x, world, noise)
         told = _told(steps, params.detectors, states, log.telemetry)
         score = jnp.stack([verdict.score for _, verdict in told])
-        t = now.t + (leo4.PACKET - WARMUP)
-        limit = jnp.where(log.telemetry.mode > 0, params.threshold[:, 1], params.threshold[:, 0])
+        t, mode = now.t + (system.dt - warmup), log.telemetry.mode
+        limit = jnp.where(mode > 0, params.threshold[:, 1], params.threshold[:, 0])
         up = ~(score <= limit) & (t > 0)
-        found = up & jnp.isinf(watch.alarm) & (t > onset(scenario) - WARMUP)
+        found = up & jnp.isinf(watch.alarm) & (t > onset(onsets, scenario) - warmup)
         alarm = jnp.where(found, t, watch.alarm)
-        out = Told(t, score, up, jnp.stack([v.blame for _, v in told]), alarm, t - watch.last, log.pointing)
+        out = Told(t, score, up, jnp.stack([v.blame for _, v in told]), alarm, t - watch.last, log.pointing, mode)
         return x, (world, tuple(s for s, _ in told), Watch(alarm, jnp.where(up, t, watch.last))), out
 
     def flow(params: Params, scenario, t, x, z):
@@ -111,33 +111,43 @@ def watched(system: System, steps: tuple) -> System:
     return system._replace(init=init, tick=tick, flow=flow, check=no_check)
 
 
-def _told(steps: tuple, params: tuple, states: tuple, telemetry: leo4.Telemetry) -> list:
+def _told(steps: tuple, params: tuple, states: tuple, telemetry) -> list:
     """State and verdict of every detector; those on residuals share them, for all have seen the same packets."""
-    shared, told = None, []
+    shared: dict = {}
+    told = []
     for (_, step), p, z in zip(steps, params, states):
         if isinstance(step, OnResiduals):
-            shared = residuals_step(z[0], telemetry) if shared is None else shared
-            after, verdict = step.step(p, z[1], shared[1], telemetry)
-            told.append(((shared[0], after), verdict))
+            if step.residuals not in shared:
+                shared[step.residuals] = step.residuals(z[0], telemetry)
+            state, r = shared[step.residuals]
+            after, verdict = step.step(p, z[1], r, telemetry)
+            told.append(((state, after), verdict))
         else:
             told.append(step(p, z, telemetry))
     return told
 
 
-def score(params: Params, scenario, now, told: Told) -> Found:
-    """The tallies of one packet."""
-    since = onset(scenario) - WARMUP
+@lru_cache
+def tallies(packet: float, onsets: Callable, warmup: float, window: float) -> Callable:
+    """The tallies of one packet [s], a score function. Equal arguments give the same function."""
+    return partial(_tallies, packet, onsets, warmup, window)
+
+
+def _tallies(packet, onsets, warmup, window, params: Params, scenario, now, told: Told) -> Found:
+    since = onset(onsets, scenario) - warmup
     inside, after = told.t > 0, told.t > since
-    mode = jnp.where(scenario.mode > 0, 1, 0)
-    ticks = told.t - leo4.PACKET + leo4.DT * jnp.arange(leo4.TICKS, dtype=told.t.dtype)
+    mode = jnp.where(told.mode > 0, 1, 0)
+    n = len(told.pointing)
+    dt = packet / n
+    ticks = told.t - packet + dt * jnp.arange(n, dtype=told.t.dtype)
     counted = (ticks >= since) & (ticks < since + HORIZON)
     beyond = jnp.where(counted, jnp.maximum(told.pointing - params.excess[mode], 0), 0)
-    excess = leo4.DT * sum(beyond[i] for i in range(leo4.TICKS))
-    sixth = jnp.floor(told.t * (SIXTHS / worlds.WINDOW) - 1e-6)
+    excess = dt * sum(beyond[i] for i in range(n))
+    sixth = jnp.floor(told.t * (SIXTHS / window) - 1e-6)
     here = (jnp.arange(SIXTHS) == sixth) & inside
     return Found(
         peak=scores.peak(told.score, inside),
-        first=scores.first(now, told.up & after, since + (WARMUP - leo4.PACKET)),
+        first=scores.first(now, told.up & after, since + (warmup - packet)),
         punctual=scores.always(~(told.up & ~after)),
         at_alarm=scores.held(told.blame, (told.up & after)[:, None]),
         later=scores.held(told.blame, (told.t >= told.alarm + LATER)[:, None]),
@@ -158,7 +168,7 @@ def run(
     Args:
         world: of the days.
         detectors: that watch, side by side.
-        key: of the noise: day i meets ``noise_of(world.system, key, i, PACKETS)``.
+        key: of the noise: day i meets ``noise_of(world.system, key, i, world.packets)``.
         days: scenarios, leaves with n in front (`worlds.days`).
         threshold: (detectors, modes); None for no alarms.
         excess: (modes,) [rad] pointing error that is healthy; None for infinite.
@@ -172,14 +182,15 @@ def run(
     """
     detectors = tuple(detectors)
     n, modes = len(detectors), len(world.modes)
-    system = watched(world.system, tuple((d.init, d.step) for d in detectors))
+    system = watched(world.system, world.onsets, world.warmup, tuple((d.init, d.step) for d in detectors))
+    score = tallies(system.dt, world.onsets, world.warmup, world.window)
     wide = lambda a, shape: np.full(shape, np.inf, np.float32) if a is None else np.asarray(a, np.float32)
     params = Params(
         world.params, tuple(d.params for d in detectors), wide(threshold, (n, modes)), wide(excess, (modes,))
     )
     params = jax.tree.map(worlds.short, params)
     with np.errstate(all="ignore"):
-        found = sweep(system, params, days, key, ticks=PACKETS, score=score, progress=progress)
+        found = sweep(system, params, days, key, ticks=world.packets, score=score, progress=progress)
     return found
 
 
@@ -190,12 +201,12 @@ class Softly(NamedTuple):
     delay: Any  # [s] expected min(delay, 60 s) of an alarm whose probability a packet is soft
 
 
-def _softly(width, params: Params, scenario, now, told: Told) -> Softly:
-    since = onset(scenario) - WARMUP
+def _softly(packet, onsets, warmup, width, params: Params, scenario, now, told: Told) -> Softly:
+    since = onset(onsets, scenario) - warmup
     counted = (told.t > since) & (told.t <= since + HORIZON)
-    limit = jnp.where(scenario.mode > 0, params.threshold[:, 1], params.threshold[:, 0])
+    limit = jnp.where(told.mode > 0, params.threshold[:, 1], params.threshold[:, 0])
     silent = jnp.where(counted, 1 - soft_scores.soft_alarm(told.score, limit, width), 1)
-    waited = jnp.where(counted, leo4.PACKET * silent, 0)
+    waited = jnp.where(counted, packet * silent, 0)
     delay = soft_scores.Delay(waited, silent, jnp.zeros_like(waited))
     return Softly(scores.peak(told.score, told.t > 0), delay)
 
@@ -219,20 +230,22 @@ def slopes(
     detectors, x = tuple(detectors), np.asarray(numbers, np.float32)
     shape = len(detectors), len(world.modes)
     h = np.full(shape, np.inf, np.float32) if threshold is None else np.asarray(threshold, np.float32)
-    system = watched(world.system, tuple((d.init, d.step) for d in detectors))
+    system = watched(world.system, world.onsets, world.warmup, tuple((d.init, d.step) for d in detectors))
     axes = np.eye(len(x) + shape[1], dtype=np.float32)
     directions = axes[:, : len(x)], axes[:, len(x) :]
     world_params, width = jax.tree.map(worlds.short, (world.params, width))
-    return jax.tree.map(np.asarray, _sloped(system, params_of)(directions, x, h, days, key, world_params, width))
+    sloped = _sloped(system, params_of, world.packets, world.onsets, world.warmup)
+    return jax.tree.map(np.asarray, sloped(directions, x, h, days, key, world_params, width))
 
 
 @lru_cache(maxsize=8)
-def _sloped(system: System, params_of: Callable):
+def _sloped(system: System, params_of: Callable, packets: int, onsets: Callable, warmup: float):
     """Of a system with detectors: value and gradient of `Softly`, compiled once."""
 
     def found(x, move, h, days, key, world_params, width):
         params = Params(world_params, params_of(x), h + move, jnp.full(h.shape[1], jnp.inf, h.dtype))
-        return sweep(system, params, days, key, ticks=PACKETS, score=partial(_softly, width), progress=False)
+        score = partial(_softly, system.dt, onsets, warmup, width)
+        return sweep(system, params, days, key, ticks=packets, score=score, progress=False)
 
     def along(direction, x, h, *rest):
         return jax.jvp(lambda x, move: found(x, move, h, *rest), (x, jnp.zeros_like(h[0])), direction)

@@ -6,7 +6,7 @@ a unit that learns from short windows alone drifts over a long day. The loss is 
 what is true at each packet, no fault or one of the faulty channels. A day is read from a packet drawn evenly from the warm-up, and
 at every packet from there on healthy and faulty days weigh alike: a unit that counts packets gains nothing.
 
-May import: gru, recording, worlds, leo4, metrics, check, compiling, noise, resuming, sweeping.
+May import: gru, recording, worlds, kinds, leo4, leo4_days, metrics, check, compiling, noise, resuming, sweeping.
 """
 
 from __future__ import annotations
@@ -25,18 +25,19 @@ from jaxatt.compiling import jitted
 from jaxatt.noise import one_key
 from jaxatt.resuming import mark_of, replaced
 from jaxatt.sweeping import progress_bar
-from jaxatt.yardstick import gru, recording, worlds
+from jaxatt.yardstick import gru, leo4_days, recording, worlds
 from jaxatt.yardstick.gru import CLASSES, HIDDEN, UNITS, Gru
+from jaxatt.yardstick.kinds import effects
 from jaxatt.yardstick.leo4 import PACKET
+from jaxatt.yardstick.leo4_days import SIZED
 from jaxatt.yardstick.metrics import HORIZON
-from jaxatt.yardstick.worlds import SIZED
 
 LENGTH = 200  # [packets] of a day in one step
-PARTS = worlds.PACKETS // LENGTH  # steps of a day
+PARTS = leo4_days.PACKETS // LENGTH  # steps of a day
 JUDGED = round(HORIZON / PACKET)  # [packets] from the onset
-SKIPPED = round(worlds.WARMUP / PACKET)  # [packets] at most, before the first that is read
+SKIPPED = round(leo4_days.WARMUP / PACKET)  # [packets] at most, before the first that is read
 HEAVIEST = 20.0  # weight of a packet over the mean, at most
-NEVER = 10 * worlds.PACKETS  # onset of a day without a fault
+NEVER = 10 * leo4_days.PACKETS  # onset of a day without a fault
 QUICKEST, SLOWEST = 2.0, 80.0  # [packets] memories of the units at the start of the training
 
 
@@ -77,12 +78,13 @@ def drawn(key, n: int) -> Days:
     """n days, a fifth of them without a fault; of the others the kinds evenly, and the public sizes of each."""
     cells = [(kind, size) for kind, sizes in SIZED.items() for size in sizes]
     cells += [None] * (len(cells) // 4)
-    table = jax.tree.map(lambda *a: np.array(a, np.float32), *(worlds.effects(cell) for cell in cells))
+    table = jax.tree.map(lambda *a: np.array(a, np.float32), *(effects(cell) for cell in cells))
     at = np.asarray(jax.random.randint(jax.random.fold_in(key, 1), (n,), 0, len(cells), jnp.int32))
-    days = worlds.days(worlds.WORLDS["leo4"], key, np.arange(n), jax.tree.map(lambda a: a[at], table))
-    onset = np.floor((worlds.onset_of(days) + worlds.WARMUP) / PACKET)
+    world = worlds.WORLDS["leo4"]
+    days = worlds.days(world, key, np.arange(n), jax.tree.map(lambda a: a[at], table))
+    onset = np.floor((worlds.onset_of(world, days) + leo4_days.WARMUP) / PACKET)
     onset = np.where(np.isfinite(onset), onset, NEVER).astype(int)
-    return Days(recording.residuals_of(days, key), onset, worlds.true_channels(days))
+    return Days(recording.residuals_of(days, key), onset, worlds.true_channels(world, days))
 
 
 class Stretch(NamedTuple):
@@ -99,27 +101,27 @@ def weights(onset, first) -> tuple[np.ndarray, np.ndarray]:
 
     onset, first: (n,) packets of the onset and of the start of the reading.
     """
-    k = np.arange(worlds.PACKETS)[:, None]
-    there, on = k + first < worlds.PACKETS, k >= onset - first
+    k = np.arange(leo4_days.PACKETS)[:, None]
+    there, on = k + first < leo4_days.PACKETS, k >= onset - first
     counts = np.sum(there & ~on, 1), np.sum(there & on & (k < onset - first + JUDGED), 1)
-    scale = 0.5 * np.sum(np.add(*counts)) / worlds.PACKETS
+    scale = 0.5 * np.sum(np.add(*counts)) / leo4_days.PACKETS
     return tuple(np.minimum(scale / np.maximum(count, 1), HEAVIEST) for count in counts)
 
 
 def stretches(days: Days, plan: Plan, rng):
-    """The stretches of a round. The lanes are at different hours; one that has ended its day begins another.
+    """The stretches of a round. The days side by side are at different hours; where one has ended another begins.
 
-    At the start of a round a lane waits, without weight, until its hour is the first. What lies behind a day's end, of one
+    At the start of a round a place waits, without weight, until its hour is the first. What lies behind a day's end, of one
     that is not read from its first packet, is its last packet without weight.
     """
     n = len(days.onset)
     order = np.concatenate([rng.permutation(n) for _ in range(plan.passes + 1)])
     first = rng.integers(0, SKIPPED + 1, n)
     calm, faulty = weights(days.onset, first)
-    lanes, at = np.arange(plan.batch), np.zeros(plan.batch, int)
+    places, at = np.arange(plan.batch), np.zeros(plan.batch, int)
     taken, begun = 0, np.zeros(plan.batch, bool)
     for k in range(plan.steps):
-        part = (k + lanes) % PARTS
+        part = (k + places) % PARTS
         fresh = part == 0
         at[fresh] = order[taken : taken + fresh.sum()]
         taken, begun = taken + fresh.sum(), begun | fresh
@@ -128,9 +130,11 @@ def stretches(days: Days, plan: Plan, rng):
         on = packet >= onset
         truth = np.concatenate([~on[:, None], on[:, None] & days.channels[at].T], axis=1)
         weight = (
-            begun * (packet < worlds.PACKETS) * np.where(on, faulty[number] * (packet < onset + JUDGED), calm[number])
+            begun
+            * (packet < leo4_days.PACKETS)
+            * np.where(on, faulty[number] * (packet < onset + JUDGED), calm[number])
         )
-        r = np.ascontiguousarray(np.moveaxis(days.r[at, np.minimum(packet, worlds.PACKETS - 1)], -1, 1))
+        r = np.ascontiguousarray(np.moveaxis(days.r[at, np.minimum(packet, leo4_days.PACKETS - 1)], -1, 1))
         yield Stretch(fresh, r, truth, weight.astype(np.float32))
 
 

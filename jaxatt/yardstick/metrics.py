@@ -2,7 +2,7 @@
 
 first: (days, detectors) [s] from onset to alarm, inf for never; punctual: whether there was no alarm before the onset.
 
-May import: nothing of ours.
+May import: kinds.
 """
 
 from __future__ import annotations
@@ -10,6 +10,8 @@ from __future__ import annotations
 from math import erfc, exp, pi, sqrt
 
 import numpy as np
+
+from jaxatt.yardstick.kinds import unit_of
 
 HORIZON = 60.0  # [s] after which a delay counts no further
 ISOLATION_FLOOR = 0.01
@@ -73,14 +75,15 @@ def detectable(sizes, shares, weights, level: float = 0.95) -> float:
 
 
 def log_score(blame, truth):
-    """ln of the probability given to the true channels, (days, detectors); p = .99 blame / sum + .01 / 11.
+    """ln of the probability given to the true channels, (days, detectors); p = .99 blame / sum + .01 / n.
 
-    blame: (days, detectors, 11); truth: (days, 11) bool.
+    blame: (days, detectors, n channels); truth: (days, n) bool.
     """
     blame = np.asarray(blame, float)
     total = blame.sum(-1, keepdims=True)
-    even = np.full_like(blame, 1 / 11)
-    p = (1 - ISOLATION_FLOOR) * np.divide(blame, total, out=even, where=total > 0) + ISOLATION_FLOOR / 11
+    n = blame.shape[-1]
+    even = np.full_like(blame, 1 / n)
+    p = (1 - ISOLATION_FLOOR) * np.divide(blame, total, out=even, where=total > 0) + ISOLATION_FLOOR / n
     return np.log(np.sum(p * np.asarray(truth)[:, None, :], axis=-1))
 
 
@@ -88,14 +91,14 @@ def weights_of(cells, sized) -> np.ndarray:
     """Weight of each cell in the macro: the mean over units, kinds and sizes in turn; 0 outside the sized kinds."""
     kinds = [kind for kind, _ in cells]
     units = {
-        unit: sorted({k for k in kinds if k in sized and k.startswith(unit)}) for unit in ("gyro", "star", "wheel")
+        unit_of(k): {other for other in kinds if other in sized and unit_of(other) == unit_of(k)}
+        for k in kinds
+        if k in sized
     }
-    present = [unit for unit in units if units[unit]]
     found = np.zeros(len(cells))
     for i, kind in enumerate(kinds):
-        unit = kind.split("_")[0]
-        if kind in units.get(unit, ()):
-            found[i] = 1 / (len(present) * len(units[unit]) * kinds.count(kind))
+        if kind in sized:
+            found[i] = 1 / (len(units) * len(units[unit_of(kind)]) * kinds.count(kind))
     return found
 
 

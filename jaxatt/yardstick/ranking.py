@@ -1,7 +1,6 @@
 """`rank`: calibrate detectors to one false-alarm rate, run the catalogue, compare them on common days.
 
-May import: baselines, bank, board, calibration, fitting,
-harness, metrics, rules, telemetry, worlds, check, loss.
+May import: board, calibration, harness, kinds, metrics, rules, telemetry, worlds, check, loss.
 """
 
 from __future__ import annotations
@@ -16,14 +15,15 @@ import numpy as np
 
 from jaxatt import check
 from jaxatt.loss import wilson
-from jaxatt.yardstick import baselines, metrics, rules, worlds
+from jaxatt.yardstick import metrics, rules, worlds
 from jaxatt.yardstick.board import VERSION, Board, plain
 from jaxatt.yardstick.calibration import DISTINCT, Calibration, calibration, typed, windows, windows_of
 from jaxatt.yardstick.harness import Found, run
+from jaxatt.yardstick.kinds import effects, single, unit_of
 from jaxatt.yardstick.metrics import HORIZON
 from jaxatt.yardstick.rules import validated
 from jaxatt.yardstick.telemetry import Detector
-from jaxatt.yardstick.worlds import CATALOGUE, HELD_OUT, MISMATCH, PAIRS, SIZED, WORLDS, World
+from jaxatt.yardstick.worlds import WORLDS, World
 
 RULESETS = ("nominal", "open")
 RATE = 0.1  # [1/h]
@@ -54,26 +54,25 @@ def rank(
     Raises:
         ValueError: no detector, two of one name, hours < 100, an unknown ruleset or cell; a detector that fails a check
             (`rules.checked`): one that looks ahead, at other days, or outside itself.
-        TypeError: a detector that gives no score () and blame (11,).
+        TypeError: a detector that gives no score () and blame (channels,).
 
     Example:
         >>> board = rank([BASELINES["chi2_10"], mine], days=32, hours=400)
         >>> print(board.table())
     """
     started = time.perf_counter()
-    ranked = validated(detectors)
     check.kind("world", world, World)
+    ranked = validated(detectors, world)
     if not isinstance(ruleset, str) or ruleset not in RULESETS:
         check.refuse("ruleset", f"be one of {', '.join(RULESETS)}", check.short(ruleset))
-    n = windows_of(hours)
+    n = windows_of(hours, world.window)
     days = check.whole("days", days, 4)
     if days > MOST:
         check.refuse("days", f"be at most {MOST}", days)
     key = None if key is None else typed(key)
-    catalogue = (
-        [(k, s) for k, sizes in CATALOGUE[world.name].items() for s in sizes] if cells is None else _cells(cells)
-    )
-    references = tuple(d for d in baselines.REFERENCE if d.name not in {r.name for r in ranked})
+    whole = [(k, s) for k, sizes in world.catalogue.items() for s in sizes]
+    catalogue = whole if cells is None else _cells(world, cells)
+    references = tuple(d for d in world.references if d.name not in {r.name for r in ranked})
     rows, names = (*ranked, *references), [d.name for d in ranked] + [d.name for d in references]
     tell = (
         (lambda text: print(f"{time.perf_counter() - started:6.0f} s  {text}", flush=True))
@@ -82,28 +81,31 @@ def rank(
     )
 
     tell("checks")
-    found_checks = [rules.checked(d) for d in ranked]
+    records = rules.records(world)
+    found_checks = [rules.checked(d, world, records) for d in ranked]
     for d, found in zip(ranked, found_checks):
         failed = [name for name, ok in found._asdict().items() if ok is False]
         if failed:
             check.refuse(f"detectors, {d.name},", "pass the checks of the yardstick", f"not {', '.join(failed)}")
-    seed = rules.seed_of(world, ranked, VERSION) if key is None else None
+    seed = rules.seed_of(world, ranked, VERSION, world.example()) if key is None else None
     key = rules.key_of(seed) if seed is not None else key
 
     tell(f"calibrate and validate on {n} windows each")
     healthy = windows(world, rows, jax.random.fold_in(key, 1), n)
     fresh = windows(world, rows, jax.random.fold_in(key, 2), n)
-    cal = calibration(len(world.modes), healthy, fresh.peak, RATE)
+    cal = calibration(world, healthy, fresh.peak, RATE)
     test = jax.random.fold_in(key, 3)
 
     def tried(cell, of=world, numbers=None, many=days):
         drawn = worlds.days(of, test, np.arange(many), cell if numbers is None else numbers)
-        return run(of, rows, test, drawn, threshold=cal.threshold, excess=cal.excess), worlds.true_channels(drawn)
+        return run(of, rows, test, drawn, threshold=cal.threshold, excess=cal.excess), worlds.true_channels(
+            world, drawn
+        )
 
     tell(f"{len(catalogue)} cells of {days} days")
     results = {cell: tried(cell) for cell in catalogue}
     tell("held out")
-    held = held_out(tried, test, days) if cells is None else {}
+    held = held_out(tried, world, test, days) if cells is None else {}
     tell("mismatch")
     robust = mismatch(tried, world, days) if cells is None else {}
     tell("time")
@@ -112,9 +114,9 @@ def rank(
     order = sorted(found_rows(names, len(ranked), catalogue, results, cal, held, robust, timed, world), key=_by_rank)
     for row in order:
         i = names.index(row["name"])
-        row |= {"tuned": rows[i].tuned, "hash": rules.digest(rows[i])}
+        row |= {"tuned": rows[i].tuned, "hash": rules.digest(rows[i], world.example())}
         row["nanoseconds"] = found_checks[i].nanoseconds if i < len(ranked) else None
-    weights = metrics.weights_of(catalogue, SIZED)
+    weights = metrics.weights_of(catalogue, world.sized)
     first, punctual = (
         np.stack([getattr(results[c][0], f) for c in catalogue])[..., : len(ranked)] for f in ("first", "punctual")
     )
@@ -126,11 +128,11 @@ def rank(
         "machine": f"{platform.machine()} {jax.default_backend()}", "seconds": time.perf_counter() - started,
     }  # fmt: skip
     matrix = {"names": names[: len(ranked)], "difference": difference, "error": error}
-    return Board(*(plain(part) for part in (header, order, cell_table(names, catalogue, results), matrix)))
+    return Board(*(plain(part) for part in (header, order, cell_table(world, names, catalogue, results), matrix)))
 
 
-def _cells(cells) -> list:
-    """The cells, if they are some, and none is there twice."""
+def _cells(world: World, cells) -> list:
+    """The cells, if they are some of the world's kinds, and none is there twice."""
     given = list(cells) if isinstance(cells, (list, tuple)) else []
     if not given:
         check.refuse("cells", "be None or hold at least one cell (kind, size)", check.short(cells))
@@ -138,7 +140,7 @@ def _cells(cells) -> list:
     for i, cell in enumerate(given):
         if cell is None:
             check.refuse(f"cells[{i}]", "be (kind, size)", None)
-        worlds.effects(cell)
+        worlds.refuse_foreign(world, cell)
         kind, size = cell
         found.append((kind, tuple(map(float, size)) if isinstance(size, (tuple, list)) else float(size)))
     if len(set(found)) < len(found):
@@ -156,16 +158,16 @@ def _version() -> str:
     return jaxatt.__version__
 
 
-def held_out(tried, key, days: int) -> dict[str, np.ndarray]:
+def held_out(tried, world: World, key, days: int) -> dict[str, np.ndarray]:
     """RMD60 (detectors,) of the kinds at sizes of the test key, and of kinds that are in no catalogue."""
     found = {}
-    for i, (kind, sizes) in enumerate(SIZED.items()):
+    for i, (kind, sizes) in enumerate(world.sized.items()):
         share = np.asarray(jax.random.uniform(jax.random.fold_in(key, 1000 + i), (days,)))
         drawn = np.exp(np.log(sizes[0]) + share * np.log(sizes[-1] / sizes[0]))
-        each = [worlds.effects((kind, float(s))) for s in drawn]
+        each = [effects((kind, float(s))) for s in drawn]
         both = jax.tree.map(lambda *a: np.array(a, np.float32), *each)
         found[f"{kind}, drawn"] = tried(None, numbers=both)[0]
-    for kind, sizes in HELD_OUT.items():
+    for kind, sizes in world.held_out.items():
         for size in sizes:
             found[f"{kind} {size}"] = tried((kind, size))[0]
     return {name: metrics.rmd(f.first, f.punctual)[0] for name, f in found.items()}
@@ -174,10 +176,11 @@ def held_out(tried, key, days: int) -> dict[str, np.ndarray]:
 def mismatch(tried, world: World, days: int) -> dict[tuple[str, str], np.ndarray]:
     """Episodes of alarms per hour (detectors,) of fault-free days in worlds that differ, 2 days a cell, by mode."""
     found = {}
-    for name, other in MISMATCH.items():
+    for name, sample in world.mismatch.items():
+        other = world._replace(name=name, sample=sample)
         episodes = tried(None, of=other, many=2 * days)[0].episodes
         for m, mode in enumerate(world.modes):
-            found[name, mode] = episodes[m :: len(world.modes)].mean(0) * 3600 / worlds.WINDOW
+            found[name, mode] = episodes[m :: len(world.modes)].mean(0) * 3600 / world.window
     return found
 
 
@@ -192,29 +195,31 @@ def clock_check(world: World, rows, key, healthy: Found, n: int) -> np.ndarray:
     return np.array([metrics.time_dependent(sixths[:, d]) for d in range(len(rows))])
 
 
-def cell_table(names, catalogue, results) -> dict:
+def cell_table(world: World, names, catalogue, results) -> dict:
     """ "kind size" -> row -> RMD60, its standard error, P10, P60."""
     table = {}
     for cell in catalogue:
         f = results[cell][0]
         mean, error = metrics.rmd(f.first, f.punctual)
         shares = [np.divide(*metrics.share_within(f.first, f.punctual, t)) for t in (10.0, HORIZON)]
-        table[label(cell)] = {name: [mean[i], error[i], shares[0][i], shares[1][i]] for i, name in enumerate(names)}
+        table[label(world, cell)] = {
+            name: [mean[i], error[i], shares[0][i], shares[1][i]] for i, name in enumerate(names)
+        }
     return table
 
 
-def label(cell) -> str:
+def label(world: World, cell) -> str:
     """A cell in words."""
     kind, size = cell
     sizes = size if isinstance(size, tuple) else (size,)
-    return f"{kind} {' + '.join(f'{s:g}' for s in sizes)}" if kind not in worlds.PLAIN else kind
+    return f"{kind} {' + '.join(f'{s:g}' for s in sizes)}" if kind not in world.plain else kind
 
 
 def found_rows(
     names, ranked: int, catalogue, results, cal: Calibration, held, robust, timed, world: World
 ) -> list[dict]:
     """One dict a row."""
-    weights = metrics.weights_of(catalogue, SIZED)
+    weights = metrics.weights_of(catalogue, world.sized)
     first = np.stack([results[c][0].first for c in catalogue])
     punctual = np.stack([results[c][0].punctual for c in catalogue])
     values = np.stack([metrics.rmd(first[i], punctual[i])[0] for i in range(len(catalogue))])
@@ -225,7 +230,7 @@ def found_rows(
     )
     difference, error = metrics.paired(first[..., :ranked], punctual[..., :ranked], weights)
     places = metrics.ranks(difference, error)
-    sized = [i for i, (kind, _) in enumerate(catalogue) if kind in SIZED]
+    sized = [i for i, (kind, _) in enumerate(catalogue) if kind in world.sized]
     rows = []
     for d, name in enumerate(names):
         clipped, mask = metrics.restricted(first[..., d]), punctual[..., d].astype(float)
@@ -242,17 +247,17 @@ def found_rows(
             "tied": bool(d < ranked and np.sum(places == places[d]) > 1),
             "macro": float(weights @ values[:, d]) if sized else float("nan"),
             "macro_se": float(np.std(again @ weights, ddof=1)), "mean_of_cells": of(sized),
-            "units": unit_means(catalogue, values[:, d]), **p_within,
+            "units": unit_means(world, catalogue, values[:, d]), **p_within,
             "p_intervals": {f"p{round(t)}": [100 * float(x) for x in wilson(*share[t])] for t in share},
-            "detectable": detectable_sizes(catalogue, first[..., d], punctual[..., d]),
+            "detectable": detectable_sizes(world, catalogue, first[..., d], punctual[..., d]),
             "isolation": isolation(catalogue, results, d), "early": float(early), "unclear": unclear,
-            "pairs": of([i for i, (kind, _) in enumerate(catalogue) if kind in PAIRS]),
+            "pairs": of([i for i, (kind, _) in enumerate(catalogue) if kind in world.pairs]),
             "threshold": {m: [cal.threshold[d, i], cal.low[d, i], cal.high[d, i]] for i, m in enumerate(world.modes)},
             "rate": {m: [cal.rate[d, i], cal.rate_low[d, i], cal.rate_high[d, i]] for i, m in enumerate(world.modes)},
             "robustness": {} if worst is None else {
                 "rate": float(worst[1][d]), "world": worst[0][0], "mode": worst[0][1],
                 "all": {f"{w}, {m}": float(r[d]) for (w, m), r in robust.items()}},
-            "consequence": consequence(catalogue, results, d), "time": float(timed[d]), "notes": notes,
+            "consequence": consequence(world, catalogue, results, d), "time": float(timed[d]), "notes": notes,
             "held_out": float(np.mean([v[d] for v in held.values()])) if held else None,
             "held_out_cells": {cell: float(v[d]) for cell, v in held.items()},
         })  # fmt: skip
@@ -274,21 +279,21 @@ def _notes(cal: Calibration, d: int, early, unclear, timed, world: World) -> lis
     return notes
 
 
-def unit_means(catalogue, values) -> dict[str, float]:
+def unit_means(world: World, catalogue, values) -> dict[str, float]:
     """Mean over the sized kinds of each unit of the mean over their sizes."""
     found = {}
-    for unit in worlds.UNITS:
-        kinds = sorted({k for k, _ in catalogue if k in SIZED and worlds.unit_of(k) == unit})
+    for unit in world.units:
+        kinds = sorted({k for k, _ in catalogue if k in world.sized and unit_of(k) == unit})
         if kinds:
             of = [np.mean([v for (k, _), v in zip(catalogue, values) if k == kind]) for kind in kinds]
             found[unit] = float(np.mean(of))
     return found
 
 
-def detectable_sizes(catalogue, first, punctual, resamples: int = 200) -> dict:
+def detectable_sizes(world: World, catalogue, first, punctual, resamples: int = 200) -> dict:
     """Smallest size found within 10 s with probability .95 and its bootstrap interval, for kinds of three sizes or more."""
     found, rng = {}, np.random.default_rng(1)
-    for kind in SIZED:
+    for kind in world.sized:
         here = [i for i, (k, _) in enumerate(catalogue) if k == kind]
         if len(here) < 3:
             continue
@@ -308,11 +313,11 @@ def isolation(catalogue, results, d: int) -> dict:
     """Mean log score at the alarm and ten seconds on, and the share of right channels; single faults, macro over units."""
     scores: dict[str, dict[str, list]] = {"at_alarm": {}, "later": {}, "right": {}}
     for cell in catalogue:
-        if not worlds.single(cell[0]):
+        if not single(cell[0]):
             continue
         f, truth = results[cell]
         hit = np.isfinite(f.first[:, d]) & f.punctual[:, d]
-        unit = worlds.unit_of(cell[0])
+        unit = unit_of(cell[0])
         for name in ("at_alarm", "later"):
             blame = getattr(f, name)[:, d]
             good = hit & np.isfinite(blame).all(-1)
@@ -328,9 +333,9 @@ def isolation(catalogue, results, d: int) -> dict:
     return found | {"right": {kind: float(np.mean(v)) for kind, v in scores["right"].items()}}
 
 
-def consequence(catalogue, results, d: int):
+def consequence(world: World, catalogue, results, d: int):
     """Mean pointing error beyond the healthy one until the alarm or 60 s [deg s], wheel kinds."""
-    here = [results[c][0] for c in catalogue if worlds.unit_of(c[0]) == "wheel" and c[0] in SIZED]
+    here = [results[c][0] for c in catalogue if unit_of(c[0]) == "wheel" and c[0] in world.sized]
     return (
         float(np.rad2deg(np.mean([metrics.mean_where(f.excess[:, d], f.punctual[:, d]) for f in here])))
         if here

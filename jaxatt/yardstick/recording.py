@@ -1,6 +1,6 @@
 """Residuals of days of leo4, recorded: what the baselines are fitted to and the learned detector learns from.
 
-May import: leo4, telemetry, worlds, baselines, contract, noise, sweeping.
+May import: leo4, leo4_days, telemetry, worlds, baselines, contract, noise, sweeping.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from jaxatt.contract import no_check
 from jaxatt.noise import one_key
 from jaxatt.sweeping import recorded
-from jaxatt.yardstick import baselines, leo4, worlds
+from jaxatt.yardstick import baselines, leo4, leo4_days, worlds
 from jaxatt.yardstick.telemetry import residuals_init, residuals_step
 
 WINDOWS = 256
@@ -56,7 +56,7 @@ def healthy(key=None, windows: int = WINDOWS) -> Healthy:
     """Residuals and features of fault-free days of leo4, NumPy; key None for the public one."""
     key = one_key(jax.random.key(0) if key is None else key)
     days = worlds.days(worlds.WORLDS["leo4"], jax.random.wrap_key_data(key), np.arange(windows), None)
-    skipped = round(worlds.WARMUP / leo4.PACKET)
+    skipped = round(leo4_days.WARMUP / leo4.PACKET)
     return Healthy(*(np.moveaxis(np.asarray(a[skipped:], np.float32), -1, 0) for a in _recorded(_all, days, key)))
 
 
@@ -84,4 +84,4 @@ def residuals_of(days, key) -> np.ndarray:
 
 def _recorded(record, days, key):
     params = jax.tree.map(worlds.short, worlds.WORLDS["leo4"].params)
-    return recorded(_SYSTEM, record, worlds.PACKETS, 1, params, days, key)
+    return recorded(_SYSTEM, record, leo4_days.PACKETS, 1, params, days, key)

@@ -1,6 +1,6 @@
 """What a machine checks before a detector is ranked, and the key of the test days, which the detectors themselves fix.
 
-May import: leo4, telemetry, worlds, check, compiling, noise, sweeping.
+May import: telemetry, worlds, check, compiling, noise, sweeping.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import hashlib
 import re
 import time
 from collections.abc import Callable, Sequence
-from functools import lru_cache
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -20,8 +20,9 @@ from jaxatt import check
 from jaxatt.compiling import jitted
 from jaxatt.noise import one_key
 from jaxatt.sweeping import recorded
-from jaxatt.yardstick import leo4, worlds
-from jaxatt.yardstick.telemetry import Detector, Telemetry
+from jaxatt.yardstick import worlds
+from jaxatt.yardstick.telemetry import Detector
+from jaxatt.yardstick.worlds import World
 
 PACKETS, DAYS = 400, 256  # of the records that the checks play
 CUTS = 100, 300  # packets after which another day follows
@@ -35,17 +36,8 @@ class Checks(NamedTuple):
     alone: bool  # the order of the days changes none
     repeats: bool  # the same input gives the same bits
     pure: bool  # no callbacks, no effects, no axes of the machine
-    runs: bool  # records without a star sample, with zero gyros and with limited torques give a score or NaN
+    runs: bool  # records such as a fault may bring, without a star sample, with zero gyros, give a score or NaN
     nanoseconds: float  # of a packet of one day, one core busy
-
-
-def example(batch: tuple = ()) -> Telemetry:
-    """A record of zeros and unit quaternions, float32."""
-    q = jnp.broadcast_to(jnp.array([1.0, 0, 0, 0], jnp.float32), (*batch, 4))
-    zeros = lambda *shape: jnp.zeros((*batch, *shape), jnp.float32)
-    return Telemetry(
-        zeros(5, 4), zeros(5, 4), q, jnp.ones(batch, bool), q, zeros(3), q, zeros(3), zeros(3), jnp.zeros(batch, jnp.int32)
-    )  # fmt: skip
 
 
 def state_of(detector: Any):
@@ -54,13 +46,12 @@ def state_of(detector: Any):
     return jax.tree.map(lambda a: short(jnp.asarray(a)), detector.init(detector.params))
 
 
-@lru_cache
-def records() -> Telemetry:
-    """Public healthy telemetry, NumPy: packets and days in front."""
-    world, key = worlds.WORLDS["leo4"], jax.random.key(1)
-    days = worlds.days(world, key, np.arange(DAYS), None)
-    params = jax.tree.map(lambda a: np.asarray(a, np.float32), world.params)
-    found = recorded(leo4.system, _telemetry, PACKETS, 1, params, days, one_key(key))
+def records(world: World):
+    """Public healthy telemetry of a world, NumPy: packets and days in front."""
+    key = jax.random.key(1)
+    drawn = worlds.days(world, key, np.arange(DAYS), None)
+    params = jax.tree.map(worlds.short, world.params)
+    found = recorded(world.system, _telemetry, PACKETS, 1, params, drawn, one_key(key))
     return jax.tree.map(lambda a: np.moveaxis(a, -1, 1), found)
 
 
@@ -86,14 +77,14 @@ def player(detector: Detector):
     return jitted(run)
 
 
-def checked(detector: Detector) -> Checks:
-    """Play public records and judge; seconds, most of them to compile.
+def checked(detector: Detector, world: World, whole) -> Checks:
+    """Play public records of a world and judge; seconds, most of them to compile. whole: `records` of the world.
 
     Example:
-        >>> all(checked(BASELINES["chi2_10"])[:5])
+        >>> all(checked(BASELINES["chi2_10"], WORLDS["leo4"], records(WORLDS["leo4"]))[:5])
         True
     """
-    play, whole = player(detector), records()
+    play = player(detector)
     bits = lambda records: [np.asarray(a) for a in jax.tree.leaves(play(detector.params, records))]
     same = lambda a, b: all(np.array_equal(x, y, equal_nan=True) for x, y in zip(a, b, strict=True))
     first = bits(whole)
@@ -110,27 +101,18 @@ def checked(detector: Detector) -> Checks:
     turned = bits(jax.tree.map(lambda a: a[:, order], whole))
     alone = all(np.allclose(a[:, order], b, rtol=1e-5, atol=1e-6, equal_nan=True) for a, b in zip(first, turned))
     try:
-        odd = bits(_odd(whole))
+        odd = bits(world.odd(whole))
         runs = not any(np.isinf(a).any() for a in odd[:1])
     except FloatingPointError:
         runs = False
     cost = 1e9 * min(spent) / (PACKETS * DAYS)
-    return Checks(causal, alone, same(first, again), pure(detector), runs, cost)
+    return Checks(causal, alone, same(first, again), pure(detector, world.example()), runs, cost)
 
 
-def _odd(whole: Telemetry) -> Telemetry:
-    """Valid records that a fault may bring: no star sample in some, gyros that read zero, torques at their limit."""
-    some = np.arange(DAYS)[None] % 3
-    blank = lambda a, which: np.where((some == which).reshape(1, DAYS, *[1] * (a.ndim - 2)), 0 * a, a)
-    limit = np.where((some == 2)[..., None, None], np.sign(whole.torque) * leo4.params.torque_max, whole.torque)
-    star = whole.star_valid & (some != 0)
-    return whole._replace(star_valid=star, gyro=blank(whole.gyro, 1), torque=limit.astype(np.float32))
-
-
-def pure(detector: Any, record: Any = None) -> bool:
+def pure(detector: Any, record: Any) -> bool:
     """Whether init and step are free of callbacks, effects and axes of the machine.
 
-    record: what a step gets beside params and z; None for telemetry of zeros, which a detector gets.
+    record: what a step gets beside params and z, such as `World.example`.
     """
     programs = _programs(detector, record)
     names = {name for program in programs for name in _primitives(program.jaxpr)}
@@ -138,7 +120,7 @@ def pure(detector: Any, record: Any = None) -> bool:
 
 
 def _programs(detector, record):
-    z, record = state_of(detector), example() if record is None else record
+    z = state_of(detector)
     return jax.make_jaxpr(detector.init)(detector.params), jax.make_jaxpr(detector.step)(detector.params, z, record)
 
 
@@ -154,7 +136,7 @@ def _primitives(jaxpr):
                 yield from _primitives(inner)
 
 
-def digest(detector: Any, record: Any = None) -> str:
+def digest(detector: Any, record: Any) -> str:
     """Hash of what a detector computes: programs of init and step without addresses, their constants, and the params.
 
     record: as of `pure`.
@@ -169,7 +151,7 @@ def digest(detector: Any, record: Any = None) -> str:
     return found.hexdigest()
 
 
-def seed_of(world: worlds.World, detectors: Sequence[Any], board: str, record: Any = None) -> int:
+def seed_of(world: World, detectors: Sequence[Any], board: str, record: Any) -> int:
     """The test key's seed, 64 bits of a hash of the board, the world and all detectors: who adds a row draws fresh days.
 
     record: as of `pure`.
@@ -184,9 +166,9 @@ def key_of(seed: int):
     return jax.random.wrap_key_data(jnp.array([seed >> 32, seed & 0xFFFFFFFF], jnp.uint32))
 
 
-def validated(detectors: Sequence[Detector]) -> tuple[Detector, ...]:
-    """The detectors, if they are some, of different names, and each gives a score and a blame of the right shape."""
-    return named("detectors", detectors, Detector, _shapes)
+def validated(detectors: Sequence[Detector], world: World) -> tuple[Detector, ...]:
+    """The detectors, if they are some, of different names, and each gives a score and a blame of the world's channels."""
+    return named("detectors", detectors, Detector, partial(_shapes, world))
 
 
 def named(name: str, entries: Sequence[Any], kind: type, shapes: Callable) -> tuple:
@@ -220,11 +202,11 @@ def stepped(d: Any, record: Any, told: str):
     return found
 
 
-def _shapes(d: Detector) -> None:
-    """Raise where a step does not give back the structure of z, and a score () and a blame (11,)."""
-    verdict = stepped(d, example(), "Verdict")
+def _shapes(world: World, d: Detector) -> None:
+    """Raise where a step does not give back the structure of z, and a score () and a blame (channels,)."""
+    verdict = stepped(d, world.example(), "Verdict")
     if not (hasattr(verdict, "score") and hasattr(verdict, "blame")):
         raise TypeError(f"`{d.name}.step` must return z, Verdict, but it is {check.short(verdict)}.")
-    for name, shape in (("score", ()), ("blame", (11,))):
+    for name, shape in (("score", ()), ("blame", (world.channels,))):
         if getattr(verdict, name).shape != shape:
             raise TypeError(f"`{d.name}.step` must return a {name} of shape {shape}, but it is {getattr(verdict, name).shape}.")  # fmt: skip

@@ -26,7 +26,7 @@ class Verdict(NamedTuple):
     """What a detector says of a packet."""
 
     score: Any  # () larger is more suspicious; NaN alarms
-    blame: Any  # (11,) >= 0: gyros 0-3, star tracker about x y z, wheels 0-3; ones where it cannot tell
+    blame: Any  # (channels,) >= 0, unit by unit, in leo4 (11,): gyros 0-3, star tracker about x y z, wheels 0-3; ones where it cannot tell
 
 
 class Detector(NamedTuple):
@@ -34,7 +34,7 @@ class Detector(NamedTuple):
 
     name: str
     init: Callable[[Any], Any]
-    step: Callable[[Any, Any, Telemetry], tuple[Any, Verdict]]
+    step: Callable[[Any, Any, Any], tuple[Any, Verdict]]  # of the world's telemetry
     params: Any = ()  # `init` and `step` get it first; any tree of arrays
     tuned: int = 0  # how many numbers were fitted
 
@@ -104,18 +104,19 @@ def residuals_step(state: Residuals, telemetry: Telemetry) -> tuple[Residuals, A
 class OnResiduals:
     """A detector's step that sees the residuals of the packet too; several in one sweep share them.
 
-    Its state is (`Residuals`, z), as `with_residuals` starts it.
+    Its state is (that of the residuals, z), as `with_residuals` starts it.
     """
 
-    step: Callable[[Any, Any, Any, Telemetry], tuple[Any, Verdict]]  # (params, z, residuals (7,), telemetry)
+    step: Callable[[Any, Any, Any, Any], tuple[Any, Verdict]]  # (params, z, residuals, telemetry)
+    residuals: Callable[[Any, Any], tuple[Any, Any]] = residuals_step  # (state, telemetry) -> state, residuals
 
-    def __call__(self, params, z, telemetry: Telemetry):
-        residuals, r = residuals_step(z[0], telemetry)
+    def __call__(self, params, z, telemetry):
+        residuals, r = self.residuals(z[0], telemetry)
         after, verdict = self.step(params, z[1], r, telemetry)
         return (residuals, after), verdict
 
 
 @cache
-def with_residuals(init: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """The init of a detector whose step is `OnResiduals`: the same function for the same ``init``."""
-    return lambda params: (residuals_init(), init(params))
+def with_residuals(init: Callable[[Any], Any], start: Callable[[], Any] = residuals_init) -> Callable[[Any], Any]:
+    """The init of a detector whose step is `OnResiduals`: the same function for the same arguments."""
+    return lambda params: (start(), init(params))
