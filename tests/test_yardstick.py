@@ -283,6 +283,21 @@ def test_no_detector_can_pass_the_oracle_which_has_its_closed_form():
     np.testing.assert_allclose(found, [58.0, 53.4, 36.0, 8.15, 1.41, 0.55, 0.26, 0.25], rtol=0.02)
 
 
+def test_the_bound_of_coloured_noise_is_that_of_what_is_new_in_it():
+    """r_k = rho r_(k-1) + e_k: the bound is that of white noise e, for the response s_k - rho s_(k-1)."""
+    rho, std, kind = -0.4, np.array(STD), "wheel_offset"
+    r = np.random.default_rng(0).normal(size=(3000, 120, 7)) * std
+    for k in range(1, 120):
+        r[:, k] += rho * r[:, k - 1]
+    channels, unit = oracle.STEPS[kind]
+    response = bank.signatures(20)[channels] * unit
+    new = response - rho * np.pad(response, ((0, 0), (1, 0), (0, 0)))[:, :-1]
+    needed = 3.454 + 1.645
+    wanted = np.mean(needed / np.sqrt(np.sum((new / std) ** 2, axis=(1, 2))))
+    assert oracle.coloured(kind, r[:, 40:], past=5.0) == pytest.approx(wanted, rel=0.03)
+    assert wanted < 0.8 * oracle.bound(kind)
+
+
 # metrics
 
 
