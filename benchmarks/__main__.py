@@ -22,6 +22,7 @@ NAMES = (
     "attitude_filters",
     "parts",
     "campaign",
+    "growth",
     "yardstick",
 )
 

@@ -320,7 +320,7 @@ def by_numpy(start, ticks: int):
 def by_diffrax(start, ticks: int):
     """() -> state (10, n) at the end by diffrax: its solver's step scanned over the periods, vmapped over scenarios.
 
-    It has no classical Runge-Kutta method; the tableau makes it one.
+    A single run keeps the state of every period, as our `simulate` does. It has no classical Runge-Kutta method; the tableau makes it one.
     """
     import diffrax  # pyright: ignore[reportMissingImports]
 
@@ -345,14 +345,15 @@ def by_diffrax(start, ticks: int):
             x, motor = tick(x)
             t = k * DT
             state = solver.init(term, t, t + DT, x, motor)
-            x, *_ = solver.step(term, t, t + DT, x, motor, state, made_jump=False)
-            return x, None
+            ahead, *_ = solver.step(term, t, t + DT, x, motor, state, made_jump=False)
+            return ahead, x if start.shape[1] == 1 else None
 
-        return tick(jax.lax.scan(step, x, jnp.arange(ticks))[0])[0]
+        end, log = jax.lax.scan(step, x, jnp.arange(ticks))
+        return tick(end)[0], log
 
     run = jax.jit(jax.vmap(one))
     each = jnp.asarray(start.T)
-    return lambda: run(each).T
+    return lambda: run(each)[0].T
 
 
 def by_jaxatt(start, ticks: int):

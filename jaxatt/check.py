@@ -351,6 +351,8 @@ def converted(params, scenario) -> tuple[Any, Any]:
     def convert(leaf):
         kind = getattr(leaf, "dtype", bool if isinstance(leaf, bool) else dtype)
         wanted = dtype if jnp.issubdtype(kind, jnp.floating) else kind
+        if isinstance(leaf, jax.Array) and leaf.dtype == wanted and not leaf.weak_type:
+            return leaf
         # NumPy where it will do: a hundred transfers to the device would take longer than a short sweep
         return jnp.asarray(leaf, wanted) if isinstance(leaf, jax.Array) else np.asarray(leaf, wanted)
 

@@ -17,6 +17,7 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.core import Tracer
 from jax.extend.core import Var, jaxpr_as_fun
 
@@ -48,9 +49,13 @@ def zeros(shapes):
     return jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
 
 
+_NOTHING = np.zeros((), np.float32)
+
+
 def traced(*operands) -> bool:
     """Whether the caller, or one of the operands, is being traced by jit, grad or vmap."""
-    return not check.concrete((operands, jnp.zeros(()) + 0))  # inside jit even 0 + 0 is a tracer
+    nothing = jnp.add(_NOTHING, _NOTHING)  # inside jit even 0 + 0 is a tracer
+    return not check.concrete((operands, nothing))
 
 
 def compiled(f: Callable, static: int, *operands) -> Callable:

@@ -190,6 +190,8 @@ def run(
 
 # one run
 
+SHORT = 10_000  # records up to which nobody asks whether a log fits in memory: the question takes as long as 1000 ticks
+
 
 def simulate(system: System, params, scenario, noise_or_key, *, ticks: int, every: int = 1):
     """Run one scenario of a closed loop.
@@ -228,7 +230,7 @@ def simulate(system: System, params, scenario, noise_or_key, *, ticks: int, ever
     params, scenario = validated(system, params, scenario, ticks=ticks)
     operands = params, scenario, source
     run = compiled(_simulate, 4, operands)
-    if not traced(operands):
+    if ticks > every * SHORT and not traced(operands):
         kept = tree_bytes(run.eval_shape(system, ticks, every, keyed, *operands))
         drawn = 8 * every * system.normals * keyed
         check.fits_memory(f"`ticks` = {ticks} with `every` = {every}", kept + drawn, "keep fewer records, by `every`")
