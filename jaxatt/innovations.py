@@ -42,7 +42,7 @@ class Flights(NamedTuple):
     readings: Any  # what ``decide`` takes, (n, T, ...)
 
 
-def put(params, numbers: Mapping[str, Any]):
+def put(params: Any, numbers: Mapping[str, Any]) -> Any:
     """params with some numbers replaced by name, ``{"wheel.friction.viscous": v, "J.x.x": j}``.
 
     Args:
@@ -65,7 +65,7 @@ def put(params, numbers: Mapping[str, Any]):
     return params
 
 
-def _put(tree: Any, path: list[str], value, name: str):
+def _put(tree: Any, path: list[str], value, name: str) -> Any:
     here, *rest = path
     of_tuple = map(str, range(len(tree))) if isinstance(tree, tuple) else ()
     known = list(getattr(tree, "_fields", of_tuple))
