@@ -35,11 +35,11 @@ EXPERIMENTS = {
     "gyro_ekf": Experiment(50, 55, "sixteen_subsets"),
     "cmg_loss": Experiment(100, 88, "figure_7"),
     "star_isolation": Experiment(70, 88, "roc"),
-    "wheel_mrac": Experiment(30, 77, "loss_of_effectiveness"),
+    "wheel_mrac": Experiment(45, 77, "loss_of_effectiveness"),
     "microsat": Experiment(90, 61, "reconfiguration"),
-    "rare_events": Experiment(45, 16, "curves"),
-    "yardstick": Experiment(230, 57, "board"),
-    "identify": Experiment(30, 6, "walk"),
+    "rare_events": Experiment(160, 16, "curves"),
+    "yardstick": Experiment(140, 55, "board"),
+    "identify": Experiment(6, 6, "walk"),
 }
 NAMES = tuple(EXPERIMENTS)
 LOOPS = tuple(name for name in NAMES if find_spec(f"jaxatt.loops.{name}"))  # which have studies and a campaign
