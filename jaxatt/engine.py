@@ -3,7 +3,7 @@
 The functions of a `System` see one scenario. Inside the engine the scenarios of a block lie side by side in the last
 axis of everything, the lanes: `jax.vmap` with the last axis takes each function over them, a single run being one lane.
 
-May import: check, clock, fields, contract, compiling, noise.
+May import: check, clock, fields, contract, compiling, noise, one_loop.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxatt import check, fields
+from jaxatt import check, fields, one_loop
 from jaxatt.clock import at_tick, time_of
 from jaxatt.compiling import compiled, shared, traced, zeros
 from jaxatt.contract import Now, System
@@ -118,10 +118,10 @@ def times(system: System, params, scenario, k):
     return k, time_of(k, system.dt, check.float_type((params, scenario)))
 
 
-def step(system: System, params, scenario, n: int, at, state, noise):
+def step(system: System, params, scenario, n: int, at, state, noise, one_way: bool = False):
     """One tick in n lanes and the flow to the next: the instant, the state ahead and the log.
 
-    at: number and time of the tick, one of `times`.
+    at: number and time of the tick, one of `times`. one_way: nothing is differentiated, so that the flow may be one loop.
     """
     dtype = check.float_type((params, scenario))
     k, t = at
@@ -141,30 +141,37 @@ def step(system: System, params, scenario, n: int, at, state, noise):
         return over_lanes(one, n)(scenario, x, z)
 
     h = system.dt / system.substeps
-    ahead = partial(rk4, lambda t, x: shared(flow, t, x))
     if system.substeps == 1:
-        x = ahead(now.t, x, h)
-    else:
-        times = now.t + h * jnp.arange(system.substeps, dtype=dtype)
-        x, _ = jax.lax.scan(lambda x, t: (ahead(t, x, h), None), x, times)
-    return now, (x, z), log
+        return now, (rk4(lambda t, x: shared(flow, t, x), now.t, x, h), z), log
+    times = now.t + h * jnp.arange(system.substeps, dtype=dtype)
+
+    def substep(params, held, x, t):
+        scenario, z = held
+        return rk4(lambda t, x: match_state(system.flow(params, scenario, t, x, z), x, "flow", "x"), t, x, h)
+
+    quick = one_way and one_loop.available()  # one step alone compiles longer so than it runs faster
+    ahead = one_loop.advanced(substep, n, params, (scenario, z), x, times) if quick else None
+    if ahead is None:
+        one = lambda x, t: (rk4(lambda t, x: shared(flow, t, x), t, x, h), None)
+        ahead, _ = jax.lax.scan(one, x, times)
+    return now, (ahead, z), log
 
 
 def run(
     system: System, params, scenario, n: int, ticks: int, chunk: int, noise: Callable, fold: Callable, tally,
-    keep: Callable = lambda tally, outs: outs,
+    keep: Callable = lambda tally, outs: outs, one_way: bool = False,
 ):  # fmt: skip
     """Run n lanes for ticks, chunk by chunk; noise(c) gives those of chunk c, shape (chunk, normals, n).
 
     fold(tally, now, log) -> tally, out is called at every tick, keep(tally, outs) after every chunk. Returns the last
     tally and what was kept, the chunks first; by default the outs, then with two leading axes (chunks, chunk). Outs
-    past the last tick are zero. Differentiable.
+    past the last tick are zero. Differentiable, unless one_way: see `step`.
     """
 
     @jax.checkpoint
     def one(carry, at, n_k):
         state, tally = carry
-        now, state, log = step(system, params, scenario, n, at, state, n_k)
+        now, state, log = step(system, params, scenario, n, at, state, n_k, one_way)
         tally, out = fold(tally, now, log)
         return (state, tally), out
 
@@ -297,4 +304,6 @@ def validated(system: System, params, scenario, n: int | None = None, ticks: int
 
 
 def _batch_last(a):
+    if a.ndim == 1:
+        return a
     return np.moveaxis(np.asarray(a), 0, -1) if check.concrete(a) else jnp.moveaxis(a, 0, -1)

@@ -161,7 +161,7 @@ def scores_of(system: System, score: Callable, n: int, ticks, params, scenarios,
 
     @partial(jax.jit, inline=True)  # traced once for its shapes and its values
     def ahead(state, at, noise):
-        now, state, log = step(system, params, scenarios, n, at, state, noise)
+        now, state, log = step(system, params, scenarios, n, at, state, noise, one_way=True)
         return state, tallied(now, log)
 
     state = start(system, params, scenarios, n)
@@ -201,7 +201,7 @@ def block_log(system: System, ticks: int, params, scenarios, key, block, lane):
         # behind a boundary, lest the compiler works the log out for this lane alone, with other roundings
         return none, shared(lambda log: jax.tree.map(lambda a: a[..., lane], log), log)
 
-    _, logs = run(system, params, scenarios, BLOCK, ticks, CHUNK, noise, fold, None)
+    _, logs = run(system, params, scenarios, BLOCK, ticks, CHUNK, noise, fold, None, one_way=True)
     return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:ticks], logs)
 
 
@@ -212,7 +212,7 @@ def block_records(system: System, record: Callable, ticks: int, every: int, para
     def fold(none, now, log):
         return none, over_lanes(lambda log: jax.tree.map(jnp.asarray, record(log)), BLOCK)(log)
 
-    _, logs = run(system, params, scenarios, BLOCK, ticks, CHUNK, noise, fold, None)
+    _, logs = run(system, params, scenarios, BLOCK, ticks, CHUNK, noise, fold, None, one_way=True)
     return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:ticks:every], logs)
 
 
@@ -279,7 +279,7 @@ def block_of(scenarios, block: int):
         here = leaf[block * BLOCK : (block + 1) * BLOCK]
         if len(here) < BLOCK:
             here = np.concatenate([here, np.repeat(here[-1:], BLOCK - len(here), axis=0)])
-        return np.moveaxis(here, 0, -1)
+        return here if here.ndim == 1 else np.moveaxis(here, 0, -1)  # to turn one takes longer than to copy it
 
     return jax.tree.map(take, scenarios)
 

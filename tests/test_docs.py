@@ -28,7 +28,18 @@ SHOWN = {
 }
 INTERNAL = {
     f"jaxatt.{name}"
-    for name in ("batching", "headers", "logfiles", "normal_space", "resuming", "stamps", "stepping", "subset", "units")
+    for name in (
+        "batching",
+        "headers",
+        "logfiles",
+        "normal_space",
+        "one_loop",
+        "resuming",
+        "stamps",
+        "stepping",
+        "subset",
+        "units",
+    )
 }
 INTERNAL |= {"jaxatt.loops"}  # how it works inside, and the folder of the loops
 # words of the house, defined where the reference begins (docs/api/index.md)

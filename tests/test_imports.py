@@ -87,7 +87,7 @@ def test_figures_and_loops_are_on_top_and_the_engine_knows_no_spacecraft():
         top = {module.split(".")[0] for module in may_import(name)}
         assert ("plot" not in top or name == "view") and "view" not in top, name
         assert "loops" not in top or name.startswith("yardstick.microsat"), name  # a world of the yardstick is a loop
-    kernel = {"check", "clock", "fields", "contract", "compiling", "noise"}
+    kernel = {"check", "clock", "fields", "contract", "compiling", "noise", "one_loop"}
     assert may_import("engine") <= kernel and may_import("sweeping") <= kernel | {"engine", "scores"}
 
 
@@ -98,7 +98,7 @@ def test_nothing_private_of_jax_is_imported_and_nothing_outside_the_package():
 
 
 def test_only_the_engine_and_the_kernels_know_of_lanes():
-    known = {"engine", "sweeping", "noise", "compiling", "filters", "mekf", "usque", "batching", "check"}
+    known = {"engine", "one_loop", "sweeping", "noise", "compiling", "filters", "mekf", "usque", "batching", "check"}
     assert {name for name, path in MODULES.items() if re.search(r"\blanes\b", path.read_text())} <= known
 
 
