@@ -20,11 +20,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.core import Tracer
 from jax.extend.core import Literal
 
 from jaxatt.compiling import OVERLAP_CHECKS
 
-MOST = 2000  # operations of a body: it takes longer to compile than its share of them
+MOST = 4000  # operations of a body, whose compilation takes longer than in proportion to them
 WIDEST = 64  # operands: the loop runs on vectors where no result overlaps an operand, which is checked pair by pair
 
 _ALIKE = """
@@ -102,7 +103,7 @@ def advanced(f: Callable, n: int, shared, held, x, times):
             for load, word in zip(loads, here[k:]):
                 env |= zip((body.invars[i] for i in load), _unpacked(word) if len(load) == 2 else [word])
             env |= zip((body.invars[i] for i in numbers), (start[place] for place in places))
-            read = lambda v: jnp.asarray(v.val, v.aval.dtype) if isinstance(v, Literal) else env[v]
+            read = lambda v: np.asarray(v.val) if isinstance(v, Literal) else env[v]
             for e in equations:
                 env[e.outvars[0]] = e.primitive.bind(*map(read, e.invars), **e.params)
             return (*map(read, body.outvars), *(jnp.zeros((), a.dtype) for a in held_operands))
@@ -164,7 +165,7 @@ def _written_out(program, *scalars) -> list:
 
 
 def _evaluated(program, given: list[_Small]) -> list[_Small]:
-    if any(isinstance(a, jax.core.Tracer) for a in program.consts):
+    if any(isinstance(a, Tracer) for a in program.consts):
         raise _NotScalar  # of a program around this one
     env: dict[Any, _Small] = dict(zip(program.jaxpr.invars, given))
     env |= zip(program.jaxpr.constvars, map(_Small.of, program.consts))
