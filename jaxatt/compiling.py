@@ -123,17 +123,19 @@ def in_threads(f: Callable, items: Iterable, jobs: int | None = None) -> Generat
         pool.shutdown(cancel_futures=True)
 
 
-# A loop with many results runs on vectors only after each is checked against each operand for overlap; more checks than
-# eight are forgone by default, and the loop with them (`jaxatt.one_loop`).
+# A loop with many results runs on vectors only after each is checked against each operand for overlap. By default more
+# than eight checks are too many, and the loop runs on single numbers (`jaxatt.one_loop`).
 OVERLAP_CHECKS = "-vectorize-memory-check-threshold=100000"
 _OPTIONS = f"-runtime-memory-check-threshold=100000,{OVERLAP_CHECKS}"
-_FLAGS = {"--xla_backend_extra_options": _OPTIONS}
+_FLAGS: dict[str, str] = {}
 if jax.__version_info__ < (0, 12):
     _FLAGS = {
         "--xla_cpu_prefer_vector_width": "512",
         # loops of up to 20 MB become one compiled function; larger ones, of gradients, would take minutes to compile
         "--xla_backend_extra_options": f"xla_cpu_small_while_loop_byte_threshold=20000000,{_OPTIONS}",
     }
+elif jax.__version_info__ < (0, 13):  # a compiler that does not know one of its flags ends the process
+    _FLAGS = {"--xla_backend_extra_options": _OPTIONS}
 
 
 def configure(cache: str | Path | None = None, cores: int | None = None) -> Path:
