@@ -63,10 +63,11 @@ def advanced(f: Callable, n: int, shared, held, x, times):
     """x after x = f(shared, held, x, t) for each t of times, over n lanes; None where f cannot be one loop.
 
     f: a function of one scenario, of element-wise arithmetic on small arrays. shared: a tree of arrays that all lanes
-    share; held, x: trees of arrays (..., n); times: (steps,) numbers.
+    share, or of numbers; held, x: trees of arrays (..., n); times: (steps,) numbers.
     """
     inside = lambda a: jax.ShapeDtypeStruct(np.shape(a)[:-1], a.dtype)
-    told = jax.tree.map(lambda a: jax.ShapeDtypeStruct(np.shape(a), a.dtype), shared)
+    shared = jax.tree.map(lambda a: jnp.asarray(a, times.dtype if isinstance(a, float) else None), shared)
+    told = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape, a.dtype), shared)
     moved = jax.tree.leaves(x)
     if not moved or any(a.size == 0 for a in moved):
         return None

@@ -79,6 +79,16 @@ def test_float32_without_64_bits_is_the_same():
         np.testing.assert_allclose(a, b, rtol=1e-6)
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_python_numbers_are_of_the_type_of_the_state(dtype):
+    _, held, x = operands(dtype)[scalars]
+    times = jnp.asarray(TIMES, dtype)
+    ways = [
+        one_loop.advanced(scalars, LANES, {"gain": gain}, held, x, times) for gain in (0.7, jnp.asarray(0.7, dtype))
+    ]
+    assert all(a.dtype == dtype and (a == b).all() for a, b in zip(*ways))
+
+
 def loops(shared, held, x, t):
     return jax.lax.while_loop(lambda a: a > 1, lambda a: a / 2, x + held)
 
