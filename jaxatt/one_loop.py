@@ -92,6 +92,7 @@ def advanced(f: Callable, n: int, shared, held, x, times):
     if len(equations) > MOST or len(operands) > WIDEST:
         return None
     held_operands, k = operands[len(moving) :], len(moving)
+    types = [a.dtype for a in held_operands]
 
     def step(moving, t):
         all_operands = (*moving, *held_operands)
@@ -107,7 +108,7 @@ def advanced(f: Callable, n: int, shared, held, x, times):
             read = lambda v: np.asarray(v.val) if isinstance(v, Literal) else env[v]
             for e in equations:
                 env[e.outvars[0]] = e.primitive.bind(*map(read, e.invars), **e.params)
-            return (*map(read, body.outvars), *(jnp.zeros((), a.dtype) for a in held_operands))
+            return (*map(read, body.outvars), *(jnp.zeros((), dtype) for dtype in types))
 
         return list(lax.reduce_window(all_operands, tuple(starts), entry, (1,), (1,), "VALID")[:k])
 

@@ -161,7 +161,7 @@ def scores_of(system: System, score: Callable, n: int, ticks, params, scenarios,
 
     @partial(jax.jit, inline=True)  # traced once for its shapes and its values
     def ahead(state, at, noise):
-        now, state, log = step(system, params, scenarios, n, at, state, noise, one_way=True)
+        now, state, log = step(system, params, scenarios, n, at, state, noise, one_way=not isinstance(ticks, int))
         return state, tallied(now, log)
 
     state = start(system, params, scenarios, n)
